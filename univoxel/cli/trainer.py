@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor
 
 from univoxel import config, lights
 from univoxel.cli.detail import made_after_training, minutes_left
@@ -119,17 +120,7 @@ def _train(
     timed = replace(cfg, minutes=left)
     with Progress(timed, begin, state, told, slowdown(timed)) as progress:
         announce(progress, photos)
-        silhouettes = find_silhouettes(photos, cfg, progress.preparing)
-        shown = silhouettes.photos, silhouettes.distance, silhouettes.doubted
-        pixels = split_pixels(*shown, most_pixels(cfg))
-        pixels = replace(pixels, edges_given=silhouettes.edges_given)
-        limited = compression.limited_to_pixels(cfg, photos.cameras, silhouettes.box)
-        if begun:
-            scene = begun[0]
-            pinned = pinned_in(silhouettes, scene, limited, progress.preparing)
-        else:
-            prepared = prepare(silhouettes, limited, progress.preparing)
-            scene, pinned = build_scene(prepared, limited), prepared.pinned
+        scene, pinned, pixels, limited, box = ready(photos, cfg, begun and begun[0], progress)
         cfg.out.mkdir(parents=True, exist_ok=True)  # only now: nothing is left of what fails
         if not state:  # of a run that was killed before anything was saved
             (cfg.out / LOG).unlink(missing_ok=True)
@@ -144,7 +135,7 @@ def _train(
         progress.clock.watch = _each(*(look and partial(look, *now) for look in watchers))
         try:
             for index in range(progress.clock.stage, len(cfg.stages)):
-                make_stage_(scene, limited, index, silhouettes.box, pinned, pixels, progress)
+                make_stage_(scene, limited, index, box, pinned, pixels, progress)
         except Cancelled:
             save_scene(scene, cfg.out, progress.state())
             raise
@@ -161,6 +152,29 @@ def _train(
     for choice in progress.chosen:
         log.info(choice.sentence)
     return cfg.out
+
+
+def ready(
+    photos: Photos, cfg: config.TrainConfig, begun: Scene | None, progress: Progress
+) -> tuple[Scene, PinnedHull | None, TrainingPixels, config.TrainConfig, tuple[Tensor, Tensor]]:
+    """What the stages train on: the scene, the pinned hull, the pixels, the configuration within
+    the limits that they set, and the box.
+
+    The distances to silhouettes, four bytes a pixel, are freed when it returns.
+
+    Args:
+        begun: the scene of a run that goes on.
+    """
+    silhouettes = find_silhouettes(photos, cfg, progress.preparing)
+    shown = silhouettes.photos, silhouettes.distance, silhouettes.doubted
+    pixels = split_pixels(*shown, most_pixels(cfg))
+    pixels = replace(pixels, edges_given=silhouettes.edges_given)
+    limited = compression.limited_to_pixels(cfg, photos.cameras, silhouettes.box)
+    if begun:
+        pinned = pinned_in(silhouettes, begun, limited, progress.preparing)
+        return begun, pinned, pixels, limited, silhouettes.box
+    prepared = prepare(silhouettes, limited, progress.preparing)
+    return build_scene(prepared, limited), prepared.pinned, pixels, limited, silhouettes.box
 
 
 def build_scene(prepared: Prepared, cfg: config.TrainConfig) -> Scene:
