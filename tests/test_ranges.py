@@ -92,7 +92,6 @@ def test_every_field_is_explained():
         (TRAIN, {"budget_mb": 1.0}, "budget_mb 1 needs adaptive capacity, got fixed"),
         (TRAIN, {"light_frame": "moon"}, "light_frame must be auto, world, turntable or camera"),
         (JointConfig(), {"rays": 3}, "rays must be at least views, got 3"),
-        (JointConfig(), {"newton_roughness": -1}, "newton_roughness must be at least 0, got -1"),
         (SceneConfig(), {"material_channels": 99}, r"at most channels \(16\), got 99"),
         (SceneConfig(), {"sky_rows": 8193}, r"sky_rows must be in \[0, 8192\], got 8193"),
         (SceneConfig(), {"roughness": "rough"}, r"roughness must be None or in \(0, 1\]"),

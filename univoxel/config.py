@@ -126,20 +126,6 @@ class LossConfig:
 
 
 @dataclass(frozen=True)
-class MetalConfig:
-    """Which points are metal, see training/metals.py."""
-
-    min_reflectance: float = setting(
-        0.25,
-        "brightest channel of a metal at least: metals in use reflect 0.4 and more",
-        least=0,
-        most=1,
-    )
-
-    __post_init__ = check_settings
-
-
-@dataclass(frozen=True)
 class EntropyConfig:
     """The prior that paint comes in few colours, see training/albedo_entropy.py."""
 
@@ -178,13 +164,9 @@ class JointConfig:
     newton_steps: int = setting(3, "at the begin of a round", least=0)
     newton_points: int = setting(1900, "of the points", least=1)
     newton_views: int = setting(8, "observations of each", least=2)
-    newton_roughness: float = setting(
-        0.1, "standard deviation that roughness follows the map with; 0: none", least=0
-    )
     newton_smooth: float = setting(
         1e-7, "Laplacian on the log map against the mean squared residual", above=0
     )
-    metal: MetalConfig = setting(MetalConfig(), "how points are decided to be metal")
     entropy: EntropyConfig = setting(
         EntropyConfig(), "the prior on few colours, where colors is set"
     )

@@ -30,7 +30,7 @@ DIRECTIONS, VIEWS = 4096, 16
 NORMAL = torch.nn.functional.normalize(torch.tensor([0.3, -0.5, 0.8]), dim=0)
 TRIED = torch.linspace(0.08, 0.95, 25)  # roughnesses
 BASES = torch.linspace(0.005, 1.0, 400)
-MIN_REFLECTANCE = 0.25  # of a metal's brightest channel, as MetalConfig.min_reflectance
+MIN_REFLECTANCE = 0.25  # of a metal's brightest channel, as in training/metals.py
 NOISE = 0.01  # sRGB
 CASES = {
     "gold ball": (torch.tensor([1.0, 0.77, 0.34]), 0.3, 1.0),

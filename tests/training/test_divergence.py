@@ -295,5 +295,5 @@ def test_a_newton_round_without_a_solution_leaves_the_map(monkeypatch):
     problem = problem_on_a_sphere(100, 12, 32, scene)
     monkeypatch.setattr(newton.equations, "solve_damped", lambda *_: None)
     solved = newton.newton_round_(scene, problem, no_metal(problem), JOINT)
-    assert solved == newton.NewtonRound([], [newton.UNSOLVABLE])
+    assert solved == newton.NewtonRound(troubles=[newton.UNSOLVABLE])
     assert (scene.sky.log_radiance == 0).all()

@@ -77,7 +77,7 @@ def test_fitted_finds_the_best_base_within_its_bounds():
         # Gauss-Newton on Cauchy costs may end in a neighbouring valley, never below the best
         assert cost[p] >= best - 1e-5
         assert cost[p] < 1.5 * best + 1e-5
-    held = fitted(constant, slope, torch.zeros(6, 5, 3), CFG.metal.min_reflectance)
+    held = fitted(constant, slope, torch.zeros(6, 5, 3), metals.MIN_REFLECTANCE)
     assert (held > fitted(constant, slope, torch.zeros(6, 5, 3), 0.0)).all()
 
 

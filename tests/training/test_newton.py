@@ -40,18 +40,18 @@ def test_newton_recovers_a_known_map():
     assert error.abs().mean() < 0.25 * true.log().abs().mean()
 
 
-def test_newton_finds_the_map_under_a_roughness_that_is_wrong():
+def test_newton_finds_the_map_under_a_roughness_that_is_wrong(monkeypatch):
     """Where roughness may change, the map is right; where it stays, the map takes the error on."""
     errors = []
-    for free in (0.0, CFG.newton_roughness):
+    for free in (1e-6, newton.FOLLOWS):
+        monkeypatch.setattr(newton, "FOLLOWS", free)
         nodes, albedo = 64, torch.tensor([0.5, 0.4, 0.3])
         scene = scene_of(tuple(albedo.tolist()), 0.45, nodes)
         problem = problem_on_a_sphere(400, 12, nodes, scene)
         shown = prefiltered_roughness(torch.full((400,), 0.3), nodes)
         problem = photographed(problem, lamps(nodes), albedo.expand(400, 3), shown)
         for _ in range(2):
-            cfg = replace(CFG, newton_roughness=free)
-            newton_round_(scene, problem, no_metal(problem), cfg)
+            newton_round_(scene, problem, no_metal(problem), CFG)
         errors.append((scene.sky.log_radiance.detach() - lamps(nodes).log()).abs().mean())
     assert errors[1] < 0.5 * errors[0]  # not all: roughness has a pull to where it was
 
@@ -193,7 +193,7 @@ def test_a_step_changes_a_point_by_no_more_than_so_much(sign):
 
     nothing, of_all = torch.zeros(5, dtype=torch.int64), [torch.arange(5)]
     numbers = torch.full((5, 3), -2.0), torch.full((5,), 0.5), torch.full((5,), 0.5)
-    points = NewtonPoints(None, nothing.bool(), nothing, nothing[:, None], of_all, *numbers, 1.0)
+    points = NewtonPoints(None, nothing.bool(), nothing, nothing[:, None], of_all, *numbers)
     points.step_([Far()], torch.zeros(3, 1))
     assert torch.equal(points.log_albedo, numbers[0] + sign * MAX_ALBEDO_CHANGE)
     assert torch.equal(points.roughness, numbers[1] + sign * MAX_ROUGHNESS_CHANGE)

@@ -20,12 +20,9 @@ RETIRED: dict[str, frozenset[str]] = {
     "LossConfig": frozenset({"albedo_smoothness", "roughness_smoothness"}),
     "StageConfig": frozenset({"lr_poses"}),
     "JointConfig": frozenset(
-        "adam albedo_smoothness metallic mirror newton roughness_smoothness surface trials".split()
-    ),
-    "MetalConfig": frozenset(
         (
-            "alike base max_evidence metallic_before near neighbours only_metal_albedo roughness "
-            "steps threshold"
+            "adam albedo_smoothness metal metallic mirror newton newton_roughness "
+            "roughness_smoothness surface trials"
         ).split()
     ),
     "EntropyConfig": frozenset(

@@ -39,6 +39,8 @@ ROUGHNESSES = (0.1, 0.2, 0.3, 0.45, 0.65, 0.9)
 STEPS = 5
 # Bounds of a base colour
 BASE = (0.005, 1.0)
+# Brightest channel of a metal at least: metals in use reflect 0.4 and more
+MIN_REFLECTANCE = 0.25
 # Points whose evidence is averaged: that of one alone is too noisy
 NEIGHBOURS = 32
 # Voxels that count as one unit of distance between points
@@ -82,7 +84,7 @@ def evidence(scene: Scene, problem: JointProblem, cfg: JointConfig) -> Tensor:
         return torch.zeros(len(counts))
     point = candidates[torch.randperm(len(candidates))[: cfg.newton_points]]
     observation = observations_of(problem, point, cfg.newton_views)
-    costs = [residuals(scene, problem, point, observation, cfg, r) for r in ROUGHNESSES]
+    costs = [residuals(scene, problem, point, observation, r) for r in ROUGHNESSES]
     dielectric, metal = torch.stack(costs).amin(0)
     limit = MAX_EVIDENCE
     ratio = (metal / dielectric).log().clamp(-limit, limit)
@@ -103,7 +105,6 @@ def residuals(
     problem: JointProblem,
     point: Tensor,
     observation: Tensor,
-    cfg: JointConfig,
     roughness: float,
 ) -> Tensor:
     """Robust costs [2, P] of points [P] in observations [P, V], as the best dielectric and as the
@@ -122,7 +123,7 @@ def residuals(
     black, mirror = shaded(0.0, 0.0), shaded(0.0, 1.0)  # linear in F0
     specular = black + F0 * (mirror - black)
     dielectric = fitted(specular, shaded(1.0, F0) - specular, target, 0.0)
-    metal = fitted(black, mirror - black, target, cfg.metal.min_reflectance)
+    metal = fitted(black, mirror - black, target, MIN_REFLECTANCE)
     return torch.stack([dielectric, metal])
 
 

@@ -23,7 +23,7 @@ from univoxel.render.observations import (
     without_exposure,
 )
 from univoxel.scene import Scene
-from univoxel.training.metals import NEAR
+from univoxel.training.metals import MIN_REFLECTANCE, NEAR
 from univoxel.training.newton import NODE_NEIGHBOURS
 
 # Metals that mirror their surroundings, found by how much they change from view to view.
@@ -56,8 +56,6 @@ REFLECTED = 0.55
 REFLECTED_AT_MOST = 1.25
 # Part of the change that the map leaves unexplained where metal mirrors sharply
 SHARP = 0.6
-# Brightest channel of a metal at least
-MIN_REFLECTANCE = 0.25
 # Degrees around a direction, whose brightest node tells how dark it is
 AROUND = 27.0
 # Share of the directions, the darkest, that base colours are read from

@@ -32,6 +32,8 @@ CAUCHY = 0.05
 # sRGB; what is left of an observation under the true map and materials. It weighs the prior of
 # roughness against the observations
 NOISE = 0.02
+# Standard deviation of the prior by which the roughness of a point follows the map
+FOLLOWS = 0.1
 # Roughness over which slopes by roughness are taken
 ROUGHNESS_STEP = 0.02
 # Log radiance by which a step changes a node of the map, or a view's gain, at most
@@ -84,7 +86,6 @@ class NewtonPoints:
     log_albedo: Tensor  # [P, 3]
     roughness: Tensor  # [P]
     prior_roughness: Tensor  # [P] roughness as it was
-    prior_weight: float  # of the squared deviation from it, >= 0; 0: roughness stays
 
     @property
     def count(self) -> int:
@@ -110,16 +111,11 @@ class NewtonPoints:
         self, part: Tensor, differences: equations.ViewDifferences | None
     ) -> tuple[Tensor, Tensor, equations.EliminatedAlbedo]:
         """Of a part under the present map, see `normal_equations`."""
-        sky, cauchy = self.problem.sky.radiance, CAUCHY
-        state = self.transport(part), sky, self.log_albedo[part], cauchy, differences
-        if not self.prior_weight:
-            return equations.normal_equations(*state)
-        step = ROUGHNESS_STEP
-        deviation = (self.roughness - self.prior_roughness)[part]
-        rougher = self.transport(part, step)
-        return equations.normal_equations(
-            *state, equations.RoughnessStep(rougher, step, self.prior_weight, deviation)
-        )
+        state = self.transport(part), self.problem.sky.radiance, self.log_albedo[part], CAUCHY
+        rougher = self.transport(part, ROUGHNESS_STEP)
+        prior, deviation = (NOISE / FOLLOWS) ** 2, (self.roughness - self.prior_roughness)[part]
+        step = equations.RoughnessStep(rougher, ROUGHNESS_STEP, prior, deviation)
+        return equations.normal_equations(*state, differences, step)
 
     def step_(self, eliminated: list[equations.EliminatedAlbedo], light_step: Tensor) -> None:
         """Change albedo and roughness as it belongs to a step of the light [3, D + B]."""
@@ -227,7 +223,6 @@ def choose_points(
     albedo, roughness, _ = scene.material(features)
     if decisions.albedo is not None:
         albedo = decisions.albedo[point]
-    prior = (NOISE / cfg.newton_roughness) ** 2 if cfg.newton_roughness else 0.0
     return NewtonPoints(
         problem,
         decisions.metal[point],
@@ -237,7 +232,6 @@ def choose_points(
         log_albedo=albedo.clamp_min(1e-3).log(),
         roughness=roughness,
         prior_roughness=roughness,
-        prior_weight=prior,
     )
 
 
@@ -289,14 +283,13 @@ def map_step_(
     coupling = torch.zeros(())  # of the channels, by roughness
     for part in points.parts:  # added up at once: all would take much memory
         hessian, gradient, albedo = points.equations(part, differences)
-        if albedo.roughness is not None:
-            hessian_part, gradient_part = equations.roughness_terms(albedo.roughness)
-            coupling, gradient = coupling + hessian_part / count, gradient - gradient_part
+        assert albedo.roughness is not None
+        hessian_part, gradient_part = equations.roughness_terms(albedo.roughness)
+        coupling, gradient = coupling + hessian_part / count, gradient - gradient_part
         system, right_side = system + hessian / count, right_side + gradient / count
         eliminated.append(albedo)
     system.diagonal(dim1=1, dim2=2).add_(damping)
-    if points.prior_weight or scene.flash is not None:
-        system, right_side = torch.block_diag(*system) - coupling, right_side.flatten()
+    system, right_side = torch.block_diag(*system) - coupling, right_side.flatten()
     tied = None
     if scene.flash is not None:  # one for all channels
         first, *others = (unknowns * torch.arange(1, 4) - 1).tolist()
