@@ -114,7 +114,7 @@ def targets(root: Path, text: str) -> list[str]:
 def tree(root: Path) -> list[str]:
     """Where the tree of CONTRIBUTING.md and the folders of the package differ."""
     text = (root / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    table = text.partition("## The tree")[2].partition("## Rules")[0]
+    table = text.partition("## The tree\n")[2].partition("\n## ")[0]
     rows = " ".join(re.findall(r"^\| (`.*?) \|", table, re.MULTILINE))
     places = root, root / "univoxel"
     gone = [n for n in re.findall(r"`([^`]+)`", rows) if not any((p / n).exists() for p in places)]
