@@ -60,7 +60,7 @@ def faults(root: Path) -> list[str]:
 
 def long_lines(text: str) -> list[tuple[int, int]]:
     """Number and length of the lines of prose that are too long; targets of links do not count."""
-    blank = _without_blocks(_without_code(text))
+    blank = without_blocks(without_code(text))
     lengths = [
         (n, len(re.sub(r"\]\([^)]*\)", "]", line)))
         for n, line in enumerate(blank.splitlines(), 1)
@@ -71,7 +71,7 @@ def long_lines(text: str) -> list[tuple[int, int]]:
 
 def measured(text: str) -> list[tuple[int, str]]:
     """Line and text of the numbers with a unit that stand outside of code and generated blocks."""
-    prose = _without_blocks(_without_code(text))
+    prose = without_blocks(without_code(text))
     prose = CODE_SPAN.sub(_blank, prose)
     prose = re.sub(r"\]\([^)]*\)", _blank, prose)
     return [(prose.count("\n", 0, m.start()) + 1, m.group()) for m in MEASURED.finditer(prose)]
@@ -79,7 +79,7 @@ def measured(text: str) -> list[tuple[int, str]]:
 
 def links(text: str) -> list[str]:
     """Files of the repository that a page links to, relative to it."""
-    prose = CODE_SPAN.sub(_blank, _without_code(text))
+    prose = CODE_SPAN.sub(_blank, without_code(text))
     targets = [target.partition("#")[0] for target in LINK.findall(prose)]
     return [t for t in targets if t and not re.match(r"[a-z]+:", t)]
 
@@ -90,7 +90,7 @@ def leaves_docs(page: Path, target: str, root: Path) -> bool:
     return path.suffix == ".md" and not path.is_relative_to((root / "docs").resolve())
 
 
-def _without_code(text: str) -> str:
+def without_code(text: str) -> str:
     """Code blocks, fenced or indented, made blank; lines stay where they are."""
     lines, fence, before = [], "", ""
     for line in text.splitlines():
@@ -110,7 +110,7 @@ def _without_code(text: str) -> str:
     return "\n".join(lines)
 
 
-def _without_blocks(text: str) -> str:
+def without_blocks(text: str) -> str:
     return doc_blocks.BLOCK.sub(_blank, text)
 
 

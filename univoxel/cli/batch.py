@@ -28,37 +28,35 @@ EACH = ("steps", "masks", "preset", "light", "minutes", "config", "changes", "sa
 @dataclass(frozen=True, kw_only=True)
 class BatchOptions:
     scenes: parsing.Scenes
-    """folders of photographs, of different names"""
+    """folders of photographs with different names"""
     out: Annotated[Path, parsing.written("NIGHT")]
-    """folder to write"""
+    """folder to write to"""
     steps: Annotated[tuple[choices.BatchStep, ...], parsing.written("STEP [STEP ...]")] = (
         choices.USUAL_STEPS
     )
-    """of each scene: train eval export page; before them poses masks, for photographs without
-    cameras or masks, as capture makes them"""
+    """steps per scene, in this order: poses masks train eval export page"""
     masks: Annotated[str, parsing.written("auto|rembg|FOLDER|none")] = "auto"
-    """as of capture, for the step masks"""
+    """source of the masks for the step masks, as in capture"""
     preset: choices.PresetOrAuto = "auto"
-    """as of train"""
-    light: choices.LightName = "hybrid"
-    """as of train"""
+    """amount of work, from draft to best; auto: what fits --minutes, else fast"""
+    light: Annotated[choices.LightName, parsing.ADVANCED] = "hybrid"
+    """lighting model; hybrid separates shadows best, the others are for comparison"""
     minutes: parsing.Minutes = None
-    """wall-clock limit of each training, above 0"""
+    """time limit of each training"""
     config: parsing.ConfigFile = None
-    """as of train"""
+    """reuse the config.json of another run in place of --preset and --light"""
     changes: parsing.Changes = ()
-    """as of train"""
-    samples: int = choices.SAMPLES
-    """of the light, per pixel of relit pictures that are measured"""
+    """change one configuration field, such as loss.radiance=0.5; repeatable"""
+    samples: Annotated[int, parsing.ADVANCED] = choices.SAMPLES
+    """light samples per pixel of relit test images"""
     jobs: Annotated[int | None, parsing.written("N", "as cores and memory allow")] = None
-    """scenes at once; each runs on --threads, or its share of the cores"""
+    """scenes at once; each gets --threads threads, or its share of the cores"""
     scheduler: parsing.Scheduler = None
-    """of a Dask cluster whose workers take the scenes, such as tcp://10.0.0.1:8786; they see the
-    same folders. Whoever reaches a scheduler can run programs on its workers"""
-    tries: Annotated[int, parsing.written("N")] = 3
-    """how often a scene whose process is killed is tried before it counts as failed"""
+    """Dask scheduler to use; anyone who can reach it can run code on its workers"""
+    tries: Annotated[int, parsing.ADVANCED] = 3
+    """attempts per scene, if its process is killed"""
     json: parsing.JsonFile = None
-    """another file for what batch.json holds; - prints it in place of the table"""
+    """also write the contents of batch.json here; - prints them, not the table"""
 
     def training(self) -> TrainConfig:
         """The configuration of a training; a UserError where there is none of that kind."""
@@ -95,13 +93,12 @@ class BatchOptions:
 
 @parsing.takes(BatchOptions)
 def command(asked: BatchOptions) -> None:
-    """Take many scenes through training, measures, mesh and page, on one machine or a cluster.
+    """Process many scenes, on one machine or a cluster.
 
-    Each scene has processes of its own: one that crashes, or that the system ends, takes no other
-    with it. What is done is kept: the same command goes on after an interruption, and tries again
-    what failed. NIGHT/index.html shows all scenes, batch.json and batch.csv hold their measures,
-    NIGHT/SCENE has what was made, NIGHT/logs what was said. Ends with exit code 2 where a scene
-    failed.
+    Each step of a scene runs in its own process, so a crash does not affect the other scenes.
+    Finished steps are kept: run the same command again to resume, or to retry failed scenes.
+    NIGHT/index.html shows all scenes, batch.json and batch.csv hold their metrics, NIGHT/SCENE the
+    results and NIGHT/logs the logs. If a scene fails, the exit code is 2.
     """
     import rich
 

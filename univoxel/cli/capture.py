@@ -11,7 +11,7 @@ from univoxel.capture.config import DEFAULTS, CaptureConfig
 from univoxel.cli.demo import MAPS, SCENE
 from univoxel.cli.evaluate import evaluate
 from univoxel.cli.export import export
-from univoxel.cli.parsing import BoxOf, Changes, Minutes, check_minutes, takes, written
+from univoxel.cli.parsing import ADVANCED, BoxOf, Changes, Minutes, check_minutes, takes, written
 from univoxel.cli.relight import relight_to_files
 from univoxel.cli.train import code_of
 from univoxel.core import choices, files, log
@@ -40,30 +40,27 @@ STEPS = ("cameras", "masks", "training", "mesh", "pictures", "page")
 @dataclass(frozen=True)
 class CaptureOptions:
     photographs: Annotated[Path, written("PHOTOS", positional=True)]
-    """what to begin with: a folder of photographs or a video; photographs with cameras, as train
-    reads them; or the folder of a trained run"""
+    """folder of photographs, video, posed data set, or folder of a trained run"""
     out: Annotated[Path, written("DIR")]
-    """folder to write: scene/, cut/, run/, pictures/, the mesh and the page"""
+    """folder to write scene/, cut/, run/, pictures/, the mesh and the page to"""
     masks: Annotated[str, written("auto|rembg|FOLDER|none")] = AUTO
-    """where masks come from: rembg, a network; a folder of masks; none, depth alone, as of cutout;
-    auto takes those that the photographs bring, or else the network, or depth if there is none"""
-    network: choices.NetworkName = choices.NETWORK
-    """which network it is; as of cutout"""
+    """source of the masks; auto: masks in PHOTOS, else a network, else depth only"""
+    network: Annotated[choices.NetworkName, ADVANCED] = choices.NETWORK
+    """network that makes the masks; later ones are larger, slower and finer"""
     box: BoxOf = None
-    """as of cutout; the cameras are those of scene/, which --until cameras ends with"""
-    keep_table: bool = False
-    """as of cutout, with --masks none and a box"""
+    """corners of a box around the object, in the world of scene/"""
+    keep_table: Annotated[bool, ADVANCED] = False
+    """keep the table inside the box; needs --masks none"""
     preset: choices.PresetOrAuto = "auto"
-    """as of train"""
-    light: choices.LightName = "hybrid"
-    """as of train"""
+    """amount of work, from draft to best; auto: what fits --minutes, else fast"""
+    light: Annotated[choices.LightName, ADVANCED] = "hybrid"
+    """lighting model; hybrid separates shadows best, the others are for comparison"""
     minutes: Minutes = None
-    """of training, above 0; as of train"""
+    """time limit of the training; cameras and masks come on top"""
     changes: Changes = ()
-    """as of train"""
+    """change one configuration field, such as loss.radiance=0.5; repeatable"""
     until: choices.Until = "page"
-    """the last step: page is all of them; cameras or masks end before training, and the folder to
-    train on is printed"""
+    """last step; cameras and masks end before training and print the folder"""
 
     @property
     def fingerprint(self) -> Any:
@@ -80,11 +77,11 @@ class CaptureOptions:
 
 @takes(CaptureOptions)
 def command(asked: CaptureOptions) -> int:
-    """From photographs to a mesh with materials and a page, in one command.
+    """Turn photographs into a relightable object, in one command.
 
-    Finds cameras, makes masks, trains, exports DIR/DIR.glb, lights the object anew and writes
-    DIR/index.html: poses, cutout, train, export, relight and eval, one after another. What is there
-    is not made again: the same command goes on after an interruption.
+    Runs poses, cutout, train, export, relight and eval, and writes a mesh, DIR/DIR.glb, and a web
+    page, DIR/index.html. Finished steps are kept: after an interruption, run the same command again
+    to resume.
     """
     check_minutes(asked.minutes)
     where, until = (asked.photographs, asked.out), asked.until

@@ -28,7 +28,7 @@ NOTES = (
 @dataclass(frozen=True)
 class DemoOptions:
     out: Annotated[Path, written("DIR")] = Path("univoxel-demo")
-    """folder for everything it writes; the page to open is DIR/index.html"""
+    """folder to write to; then open DIR/index.html"""
 
 
 @takes(DemoOptions)

@@ -33,8 +33,8 @@ class DetailOptions:
     run: Run
     """folder of a trained run"""
     data: DataOf = None
-    """folder of the photographs, where they were moved"""
-    size: Annotated[int | None, written("TEXELS", "what photographs resolve")] = None
+    """folder of the photographs, if they were moved"""
+    size: Annotated[int | None, written("TEXELS", "from the photographs' resolution")] = None
     """width of the square texture, a power of 2 from 256 to 8192"""
 
     def __post_init__(self) -> None:
@@ -47,7 +47,9 @@ class DetailOptions:
 
 @takes(DetailOptions)
 def command(asked: DetailOptions) -> Path | None:
-    """Make the detail of a run, in RUN/detail; None, with a line, where its photographs have none.
+    """Add a texture from full-size photographs to a run.
+
+    Writes RUN/detail, or nothing if the photographs are no finer than the run's grid.
 
     Raises:
         UserError: the run or its photographs cannot be read, or there is no surface.

@@ -45,15 +45,15 @@ class Finding:
 @dataclass(frozen=True)
 class DoctorOptions:
     json: JsonFile = None
-    """file for the findings; - prints them in place of the table"""
+    """write the findings to a file; - prints them, not the table"""
 
 
 @takes(DoctorOptions)
 def command(asked: DoctorOptions) -> None:
-    """Look at this installation and machine, and say what they lack.
+    """Check this installation and this machine.
 
-    Processor and the kernels built for it, Embree, torch, OpenMP, threads, memory, extras. Ends
-    with exit code 2 where training would be refused.
+    Checks the processor and its kernels, Embree, PyTorch, OpenMP, threads, memory and optional
+    packages. If training is not possible, the exit code is 2.
     """
     import rich
 

@@ -19,18 +19,16 @@ class EnvmapOptions:
     run: Run
     """folder of a trained run"""
     out: Annotated[File, written("FILE.exr|hdr")]
-    """the map, linear radiance, in 32 bits a channel as .exr, a pixel as .hdr; a picture of it goes
-    beside, with the true map if the data set has it"""
+    """environment map to write, in linear radiance; a preview is written beside it"""
     height: Annotated[int, written("ROWS")] = MAP_ROWS
-    """rows of the map; it is twice as wide"""
+    """rows of the map; it has twice as many columns"""
     light_of: LightOf = None
-    """training view, by name or number, whose map it is, where the run was trained with
-    --varying"""
+    """training view whose light to write, by name or number; see train --varying"""
 
 
 @takes(EnvmapOptions)
 def command(asked: EnvmapOptions) -> None:
-    """Write the light of the photographs as an environment map."""
+    """Write the recovered light as an environment map."""
     found = envmap(**vars(asked))
     print(asked.out)
     if found:

@@ -30,30 +30,26 @@ class EvaluateOptions:
     run: parsing.Run
     """folder of a trained run"""
     data: parsing.DataOf = None
-    """folder of the photographs"""
+    """folder of the photographs, if they were moved"""
     save: Annotated[parsing.File | None, parsing.written("DIR", "none are written")] = None
-    """folder for the rendered pictures"""
+    """folder to write the rendered images to"""
     json: parsing.JsonFile = None
-    """file for the measures; - prints them in place of the table"""
+    """write the metrics to a file; - prints them, not the table"""
     samples: int = SAMPLES
-    """of the light, per pixel of relit pictures"""
-    bounces: int = BOUNCES
-    """reflections between parts of the object in relit pictures, 0 for none"""
+    """light samples per pixel of relit images"""
+    bounces: Annotated[int, parsing.ADVANCED] = BOUNCES
+    """light bounces between parts of the object in relit images"""
     light_of: parsing.LightOf = None
-    """training view, by name or number, in whose light novel views are rendered, where the run was
-    trained with --varying"""
-    test_every: Annotated[int | None, parsing.written("N", "the test split")] = None
-    """measure the first of every so many photographs, in order of all names; none of them may have
-    been trained on"""
-    background: Behind = "black"
-    """what novel views are composited on"""
-    fit_light: bool = False
-    """render each novel view in the light in which it looks most like its photograph, as the field
-    does where light differs from photograph to photograph"""
+    """training view whose light to render in, by name or number; see train --varying"""
+    test_every: Annotated[int | None, parsing.written("N", "the test split", advanced=True)] = None
+    """use every Nth photograph as a test view; none may be a training photograph"""
+    background: Annotated[Behind, parsing.ADVANCED] = "black"
+    """background of the novel views"""
+    fit_light: Annotated[bool, parsing.ADVANCED] = False
+    """fit the light to each test photograph before measuring, as many papers do"""
 
     full_size: bool = False
-    """measure novel views at the full size of the photographs too, with the run's detail: PSNR,
-    SSIM, and how much of the photographs' detail they show, octave by octave"""
+    """also measure novel views at the photographs' full size, with the run's detail"""
 
     def __post_init__(self) -> None:
         if self.samples < 1 or self.bounces < 0:
@@ -69,7 +65,7 @@ class EvaluateOptions:
 
 @parsing.takes(EvaluateOptions)
 def command(asked: EvaluateOptions) -> None:
-    """Measure a run on the test views and print the table."""
+    """Measure a run on its test views."""
     import rich
 
     with parsing.json_file(asked.json) as file:

@@ -50,17 +50,17 @@ class InfoOptions:
     run: Run
     """folder of a trained run"""
     json: JsonFile = None
-    """file for the numbers; - prints them in place of tables"""
+    """write the numbers to a file; - prints them, not the tables"""
     picture: Annotated[File | None, written("FILE.png", "none")] = None
-    """where the grid's nodes are that hold features, and a bar of bytes by part"""
+    """draw where the grid stores features, and the size of each part"""
 
 
 @takes(InfoOptions)
 def command(asked: InfoOptions) -> None:
-    """Say what a model consists of, and what was chosen for it.
+    """Show the verdict, the parts and the sizes of a run.
 
-    Parameters and bytes by part, and sizes. Also whether points that are matched between the
-    photographs lie where the cameras put them.
+    Lists parameters and bytes by part, and the epipolar error of points that are matched between
+    the photographs.
     """
     import rich
     from rich.text import Text
