@@ -61,18 +61,18 @@ def chart(
     jobs: int = 1,
     scheduler: str | None = None,
 ) -> Path:
-    """Train every scene with presets and knobs; write out/chart.json, .png and .svg.
+    """Train every scene with presets and variants; write out/chart.json, .png and .svg.
 
     Args:
-        scenes: folders of data sets, of different names.
-        out: every training is kept in out/SCENE/SETTING, and not done again by a later call.
-        preset: what the knobs are turned around.
-        light: of the presets and the knobs.
-        quick: draft, the preset and three knobs.
-        only: names of settings; all when empty.
-        changes: FIELD=VALUE of the configuration, for all.
-        samples: of the light per pixel of relit pictures in evaluation.
-        jobs, scheduler: trainings at once here, or who else trains; as of runner.run_pairs.
+        scenes: folders of data sets with different names.
+        out: folder that keeps every training in SCENE/SETTING; later calls reuse them.
+        preset: preset to vary.
+        light: lighting model.
+        quick: draft, the preset and three variants.
+        only: names of settings; empty: all.
+        changes: FIELD=VALUE of the configuration, for all trainings.
+        samples: light samples per pixel of relit images.
+        jobs, scheduler: trainings at once, or a Dask scheduler; see runner.run_pairs.
 
     Returns:
         out/chart.png.
@@ -155,7 +155,7 @@ def plot(outcomes: Sequence[Outcome], stem: Path) -> list[Path]:
             axis.set_title(f"{scene}: {measure.title}", size=10)
         log, *unused = row[len(shown) :]
         _draw_logs(log, [o for o in outcomes if o.scene == scene and not o.error])
-        log.set_title(f"{scene}: held-out rays of training views, dB", size=10)
+        log.set_title(f"{scene}: validation PSNR of training views, dB", size=10)
         for axis in (*row[: len(shown)], log):
             axis.set_xscale("log")
             axis.xaxis.set_major_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))

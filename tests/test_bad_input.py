@@ -51,7 +51,7 @@ def refused(capsys):
         (shutil.rmtree, r"data: expected a folder with a scene, got nothing there"),
         (
             lambda d: (d / "transforms_train.json").write_text('{"frames": [}'),
-            r"transforms_train\.json: broken JSON in line 1, column 13",
+            r"transforms_train\.json: invalid JSON in line 1, column 13",
         ),
         (
             lambda d: [(d / "train" / f"r_{v}.png").unlink() for v in range(1, 5)],
@@ -99,9 +99,9 @@ def another_version(path):
     [
         (another_version, r"scene\.safetensors: expected checkpoint format \d+, got 99"),
         (lambda p: save_file(load_file(p), p), r"expected checkpoint format \d+, got None"),
-        (lambda p: p.write_bytes(p.read_bytes()[:-9]), r"scene\.safetensors: damaged or cut short"),
-        (lambda p: p.write_bytes(b""), r"scene\.safetensors: damaged or cut short"),
-        (Path.unlink, r"no checkpoint in .*run .*univoxel train"),
+        (lambda p: p.write_bytes(p.read_bytes()[:-9]), r"scene\.safetensors: damaged or truncated"),
+        (lambda p: p.write_bytes(b""), r"scene\.safetensors: damaged or truncated"),
+        (Path.unlink, r"not a trained run .*run .*univoxel train"),
     ],
 )
 def test_checkpoints_that_cannot_be_used(run, data, tmp_path, refused, change, message):
@@ -265,5 +265,5 @@ def test_the_template_is_sound(run, tmp_path):
     assert names == {p.name for p in out.iterdir()}
     assert {"doubt.albedo", "doubt.roughness"} <= set(read_exr(out / "r_0.exr"))
     assert 0 <= json.loads((out / "a.json").read_text())["trust"]["doubt_albedo"] <= 1
-    assert "Doubt of albedo" in (run / "trust.txt").read_text()
+    assert "Uncertainty of the albedo" in (run / "trust.txt").read_text()
     assert read_image(run / "preview.png").shape == (16, 5 * 16, 3)

@@ -51,8 +51,8 @@ class StillBackground(DataError):
 
     def __init__(self, seen: str):
         super().__init__(
-            f"{seen}: the object was turned before a still camera. Only what is on the object "
-            "counts: make masks of it and give them as masks=DIR",
+            f"{seen}: it seems that the object was turned before a static camera. Make masks of "
+            "the object and pass them as masks=DIR, so that the background is ignored",
             "masks",
         )
         self.seen = seen

@@ -84,7 +84,7 @@ def load_world(run: Path) -> np.ndarray | None:
     except (KeyError, TypeError, ValueError, OverflowError):
         moved = np.empty(0)
     if moved.shape != (3, 4) or not np.isfinite(moved).all():
-        raise DataError(f"{path}: expected from_data, a rotation and a translation, got none")
+        raise DataError(f"{path}: expected from_data, a rotation and a translation")
     return moved
 
 
@@ -92,7 +92,7 @@ def _source_of(run: Path) -> Source:
     """What photographs a run's config.json says that it was trained on."""
     path = run / "config.json"
     if not path.is_file():
-        raise DataError(f"{run}: expected the folder of a run, got no {path.name}")
+        raise DataError(f"{run}: expected the folder of a run, but it has no {path.name}")
     config = read_json(path)
     if not isinstance(config, dict):
         raise DataError(f"{path}: expected an object with the configuration, got {config!r:.80}")
@@ -157,13 +157,19 @@ class Verdict:
         """Whether a stage made no step at all: what it is for is missing."""
         return any(made == 0 for made in self.evidence.steps.values())
 
-    def sentence(self) -> str:
-        """The verdict in a line."""
-        quality = "" if self.evidence.psnr is None else f"validation {self.evidence.psnr:.1f} dB"
+    def lines(self) -> list[str]:
+        """The verdict, and a line with the remedies, if there are any."""
+        psnr = self.evidence.psnr
+        quality = () if psnr is None else (f"validation PSNR {psnr:.1f} dB",)
         said = f"Result: {self.word}"
-        told = "; ".join(self.reasons) or quality
-        help_ = f". What helps: {'; or '.join(self.remedies)}" if self.remedies else ""
-        return f"{said}, {told}{help_}" if told else f"{said}{help_}"
+        if told := "; ".join(self.reasons or quality):
+            said += f", {told}"
+        remedies = "; or ".join(self.remedies)
+        return [said, f"To improve it: {remedies}"] if remedies else [said]
+
+    def sentence(self) -> str:
+        """The verdict and its remedies in one paragraph."""
+        return ". ".join(self.lines())
 
 
 def judge(evidence: Evidence) -> Verdict:
@@ -182,33 +188,33 @@ def judge(evidence: Evidence) -> Verdict:
         evidence.psnr,
         GOOD_DB,
         POOR_DB,
-        f"validation {{:.1f}} dB, where {GOOD_DB:g} and more are good",
-        "sharp photographs of one exposure, with the object still and the light unchanged",
+        f"validation PSNR {{:.1f}} dB ({GOOD_DB:g} or more is good)",
+        "photograph sharply, with one exposure, and move neither object nor light",
     )
     check(
         evidence.outline,
         GOOD_OUTLINE,
         POOR_OUTLINE,
-        "{:.0%} of the outline is not where the masks have it",
-        "better masks: look at them with `univoxel inspect`",
+        "{:.0%} of the outline differs from the masks",
+        "correct the masks",
     )
     check(
         evidence.hidden,
         GOOD_HIDDEN,
         POOR_HIDDEN,
         "{:.0%} of the surface is seen by too few cameras",
-        "more photographs: `univoxel report` shows from where",
+        "take more photographs (`univoxel report` shows from where)",
     )
     check(
         evidence.residual,
         GOOD_RESIDUAL,
         POOR_RESIDUAL,
         "{:.0%} of the surface differs visibly from its photographs",
-        "`--preset full`, if the object did not move and its masks are right",
+        "train with `--preset full`, if masks are right and the object did not move",
     )
     if evidence.troubles:
         times = "once" if evidence.troubles == 1 else f"{evidence.troubles} times"
-        faults.append((False, f"training met trouble {times} and went on", "another `--seed`"))
+        faults.append((False, f"training had to recover {times}", "try another `--seed`"))
     faults.sort(key=lambda found: not found[0])
     word: Word = "good" if not faults else "retake" if faults[0][0] else "usable"
     reasons = [reason for _, reason, _ in faults]
@@ -216,13 +222,15 @@ def judge(evidence: Evidence) -> Verdict:
     if evidence.steps:
         word = "unfinished"
         made = ", ".join(f"{share:.0%} for {name}" for name, share in evidence.steps.items())
-        why = "it was stopped" if evidence.stopped else "the time was up"
+        why = "it was stopped" if evidence.stopped else "the time limit was too short"
         reasons.insert(0, f"{why}: of the planned steps it made {made}")
         needed = None if evidence.minutes is None else math.ceil(evidence.minutes)
         if evidence.stopped or evidence.limit is None:
-            remedies.insert(0, "train it to the end")
+            remedies.insert(0, "resume the training with `--resume`")
         elif needed is not None:
-            remedies.insert(0, f"`--minutes {max(needed, math.floor(evidence.limit) + 1)}`")
+            remedies.insert(
+                0, f"train with `--minutes {max(needed, math.floor(evidence.limit) + 1)}`"
+            )
     remedies = list(dict.fromkeys(remedies))[:2]
     return Verdict(word, not evidence.steps, tuple(reasons), tuple(remedies), evidence)
 

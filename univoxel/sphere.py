@@ -206,8 +206,8 @@ def gaps(
         low = azimuth[begin]
         side = side_of(low + steps[k] / 2)
         told.append(
-            f"no photograph from the {side}, {steps[k]:.0f} degrees between {names[begin]} and "
-            f"{names[end]}"
+            f"no photograph from the {side}: there is a gap of {steps[k]:.0f} degrees between "
+            f"{names[begin]} and {names[end]}"
         )
     if height.max() < HIGH:
         told.append(f"no photograph from above {height.max():.0f} degrees")

@@ -104,7 +104,7 @@ def test_a_killed_training_starts_anew(out, tmp_path, monkeypatch):
     folder = tmp_path / "ball" / "small"
     shutil.copytree(out / "ball" / "small", folder)
     (folder / "result.json").unlink()
-    (folder / "run" / FILE).write_bytes(b"cut short")
+    (folder / "run" / FILE).write_bytes(b"truncated")
     begun = []
 
     def train(config):
@@ -160,8 +160,8 @@ def test_mistakes_are_found_before_anything_is_trained(data, tmp_path, trained):
         with pytest.raises(error, match=match):
             runner.run(scenes, settings, out, samples)
 
-    refused(ValueError, "expected scenes in folders of different names", [data, other])
-    refused(ValueError, "expected a scene, a folder of photographs, or more; got none", [])
+    refused(ValueError, "expected scene folders with different names", [data, other])
+    refused(ValueError, "expected at least one scene", [])
     refused(DataError, "transforms_test", [other])
     refused(
         ValueError, r"settings of different names, got \['small', 'small'\]", [data], [SMALL] * 2

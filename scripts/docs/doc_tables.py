@@ -170,7 +170,7 @@ def _chart(record: dict[str, Any], part: str) -> str:
 
 def _lights(record: dict[str, Any], _: str) -> str:
     columns = (SECONDS, NVS, ALBEDO, ROUGHNESS, RELIT, NORMALS, MEMORY)
-    columns += (("grey ball, dB", "map_ball_psnr", 1),)
+    columns += (("diffuse sphere, dB", "map_ball_psnr", 1),)
     columns += (("brightest direction, degrees off", "map_brightest_degrees", 1),)
     runs = [((_scene(r["scene"]), f"`{r['setting']}`"), r["measures"]) for r in record["rows"]]
     return measured(runs, ("scene", "light"), columns)

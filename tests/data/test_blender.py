@@ -226,7 +226,7 @@ BROKEN = {
         lambda f: without(f, "transforms_train.json"),
         r"expected photographs .*, got train \(looked for transforms_train\.json, ",
     ),
-    "broken JSON": (text(b'{\n"frames": [,]\n}'), "broken JSON in line 2, column 12"),
+    "invalid JSON": (text(b'{\n"frames": [,]\n}'), "invalid JSON in line 2, column 12"),
     "not UTF-8": (text(b'{"frames": "\xff\xfe"}'), "expected text in UTF-8"),
     "a list": (text(b"[1, 2]"), r"expected a JSON object, got \[1, 2\]"),
     "no frames": (root(frames=[]), r"expected a list of frames, got \[\]"),
@@ -252,8 +252,8 @@ BROKEN = {
     "a fisheye": (root(is_fisheye=True), "frame 0: expected one of the camera models .* a fisheye"),
     "another camera": (frame(camera_model="EQUIRECTANGULAR"), "models .* got 'EQUIRECTANGULAR'"),
     "size unlike the file's": (root(w=60, h=30), r"pictures of 60x30 pixels \(w and h\), got 6x4"),
-    "transparent": (transparent, "all 2 pictures are fully transparent"),
-    "opaque": (all_opaque, "all 2 pictures are fully opaque: cut the object out"),
+    "transparent": (transparent, "all 2 images are fully transparent"),
+    "opaque": (all_opaque, "all 2 images are fully opaque: cut the object out"),
     "no alpha": (opaque, r"r_1\.png: expected an alpha channel or a mask r_1_mask\.png"),
     "grey": (gray, r"r_1\.png: expected a picture with 3 or 4 channels, got 1"),
     "mask of another size": (small_mask, r"r_1_mask\.png: expected 6x4 pixels, got 2x2"),
@@ -265,7 +265,7 @@ BROKEN = {
     "small matrix": (matrix(lambda m: m[:2]), "frame 0: expected a finite 4x4"),
     "ragged matrix": (matrix(lambda m: [[1.0], [1.0, 2.0]]), "frame 0: expected a finite 4x4"),
     "NaN in the matrix": (matrix(lambda m: m * np.nan), "frame 0: expected a finite 4x4"),
-    "singular matrix": (
+    "a singular one": (
         matrix(lambda m: m * [0, 1, 1, 1]),
         "frame 0: expected a rigid .* scales by 1, 1, 0",
     ),

@@ -181,7 +181,7 @@ def test_lists_are_read_as_they_were_meant(tmp_path, writer, name, change):
         assert torch.equal(alpha, wanted[color][0])
         torch.testing.assert_close(camera, wanted[color][1:], atol=1e-5, rtol=1e-5)
     about = load_photos(data).about
-    assert ("cameras of 10 scaled to smaller pictures" in about) == (name == "smaller")
+    assert ("cameras of 10 scaled to smaller images" in about) == (name == "smaller")
 
 
 def test_pictures_of_one_name_in_two_folders(tmp_path):
@@ -244,7 +244,7 @@ def test_a_lens_of_larger_pictures_is_told(tmp_path, caplog):
     text("transforms.json", ('"w": 12, ', ""), ('"h": 8, ', ""))(data)
     text("transforms.json", (r'"cx": [\d.]+', '"cx": 12.0'), (r'"cy": [\d.]+', '"cy": 8.0'))(data)
     load_photos(data)
-    assert "cx and cy are at the border of pictures of 12x8 pixels" in caplog.text
+    assert "cx and cy are at the border of the 12x8 pixels" in caplog.text
 
 
 def no_images(place, other):
@@ -303,7 +303,7 @@ def test_what_helps_is_said(tmp_path, writer, change, message):
 def test_cameras_of_a_rig_are_named(tmp_path):
     write_metashape(tmp_path, scene())
     text("cameras.xml", ('label="not_placed"', 'label="right" master_id="0"'))(tmp_path)
-    assert "; 1 of a rig, whose place is that of a master camera" in load_photos(tmp_path).about
+    assert "; 1 belong to a rig" in load_photos(tmp_path).about
 
 
 def test_one_photograph_is_told(tmp_path, caplog):

@@ -90,9 +90,9 @@ def test_places_of_colmap(tmp_path):
     [
         (b"[" * 100_000, "nested too deep"),
         (b'{"a":' * 100_000, "nested too deep"),
-        (b'{"a": ' + b"1" * 5000 + b"}", "an integer of too many digits"),
+        (b'{"a": ' + b"1" * 5000 + b"}", "an integer has too many digits"),
         (b"\xff\xfe{}", "expected text in UTF-8"),
-        (b"{", "broken JSON in line 1, column 2"),
+        (b"{", "invalid JSON in line 1, column 2"),
     ],
 )
 def test_json_that_cannot_be_read(data, tmp_path, text, message):

@@ -79,7 +79,7 @@ def test_pictures_that_are_not_there(tmp_path):
         (tmp_path / place / "004.png").unlink()
     photos = load_photos(tmp_path)
     assert photos.names == ["001", "002", "003", "005", "006", "007", "008"]
-    assert "1 of 10 listed left out" in photos.about
+    assert "1 of 10 listed images left out" in photos.about
     wanted = written.poses[[1, 2, 3, 5, 6, 7, 8], :3, 3]
     np.testing.assert_allclose(photos.cameras.camera_to_world[:, :, 3], wanted, atol=1e-5)
 
@@ -115,13 +115,13 @@ def leaning(arrays):
         ),
         (
             edited(lambda a: a.update(world_mat_2=np.full((4, 4), np.nan))),
-            "npz: world_mat_2 holds NaN or infinity",
+            "npz: world_mat_2 contains NaN or infinity",
         ),
         (
             edited(lambda a: a.update(world_mat_2=np.ones((4, 4)))),
-            "world_mat_2: expected a projection onto a picture, got a singular matrix",
+            "world_mat_2: expected a projection matrix, got a singular one",
         ),
-        (edited(leaning), "world_mat_3: expected pixels with axes square .* lean by 1 pixels"),
+        (edited(leaning), "world_mat_3: perpendicular axes, got axes that are skewed by 1 pixels"),
         (
             edited(lambda a: a.update(world_mat_2=np.diag([50.0, 1, 1, 1]) @ a["world_mat_2"])),
             "world_mat_2: expected cx between -12 and 24, got 300",

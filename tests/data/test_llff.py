@@ -52,9 +52,9 @@ def one(row, column, new):
     [
         (
             lambda f: (f / "poses_bounds.npy").write_bytes(b"no array"),
-            "poses_bounds.npy: expected an array of NumPy, could not read it",
+            "poses_bounds.npy: this NumPy array could not be read",
         ),
-        (rows(lambda _: np.array({"a": 1})), "npy: expected an array of NumPy, could not read it"),
+        (rows(lambda _: np.array({"a": 1})), "npy: this NumPy array could not be read"),
         (rows(lambda r: r[:, :15]), r"npy: expected \[V, 17\] numbers, got \(10, 15\)"),
         (rows(lambda r: r.astype(str)), r"npy: expected \[V, 17\] numbers, got 10 of <U"),
         (rows(lambda r: r[1:]), "expected a row for each of 10 photographs in .*images, got 9"),

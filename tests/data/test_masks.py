@@ -165,7 +165,7 @@ def test_folders_that_are_none(tmp_path, folder):
     with pytest.raises(DataError, match="masks: expected a folder of masks, got nothing there"):
         masks_in(folder, asked)
     folder.mkdir()
-    with pytest.raises(DataError, match=r"expected masks .*, got no picture"):
+    with pytest.raises(DataError, match=r"expected masks .*, found no image"):
         masks_in(folder, asked)
 
 
@@ -286,15 +286,15 @@ def test_soft_masks_stay_as_they_are(tmp_path):
     ("picture", "message"),
     [
         (Image.fromarray(np.array([[0, 1, 2]], np.uint8)), "largest value of 2 of 255"),
-        (palette([[0, 1, 2]], (0, 0, 0), (128, 0, 0), (0, 128, 0)), "a palette of 3 colours"),
-        (palette([[0, 1, 1]], (9, 9, 200), (128, 0, 0)), "a palette of 2 colours"),
+        (palette([[0, 1, 2]], (0, 0, 0), (128, 0, 0), (0, 128, 0)), "a palette with 3 colours"),
+        (palette([[0, 1, 1]], (9, 9, 200), (128, 0, 0)), "a palette with 2 colours"),
         (
             Image.fromarray(np.random.default_rng(0).integers(0, 255, (9, 9, 3), np.uint8)),
-            "got a picture of several colours",
+            "got an image with several colours",
         ),
         (
             Image.fromarray(np.array([[[255] * 3, [255, 0, 0]]], np.uint8)),
-            "got a picture of several colours",
+            "got an image with several colours",
         ),
     ],
 )
@@ -355,7 +355,7 @@ def test_masks_of_pictures_that_were_mirrored_or_turned(lit, way, word):
     assert load_photos(lit).alpha.any()
     for path in (lit / "masks").iterdir():
         save(path, way(np.asarray(Image.open(path))))
-    with pytest.raises(DataError, match=f"8 of 8 masks .* fit their photographs when {word}"):
+    with pytest.raises(DataError, match=f"8 of 8 masks .* fit their photographs only when {word}"):
         load_photos(lit)
 
 
@@ -378,7 +378,7 @@ def test_colours_that_are_multiplied_by_alpha_are_told(lit, caplog, straight):
         write_png(path, np.concatenate([color, alpha[..., None]], -1))
         mask.unlink()
     load_photos(lit)
-    assert ("colours seem to be multiplied by alpha" in caplog.text) != straight
+    assert ("colours seem to be premultiplied by alpha" in caplog.text) != straight
 
 
 def test_faint_masks_are_refused(lit):
@@ -457,7 +457,7 @@ def test_colours_tell_what_masks_were_made_of(tmp_path, caplog, square, upright)
     assert torch.equal(photos.alpha > 127, red)
     assert photos.alpha.any()
     what = "the upright picture" if upright else "the pixels as they are stored"
-    assert f"8 photographs have an EXIF orientation: their masks are taken as made of {what}" in (
+    assert f"8 photographs have an EXIF orientation: their masks seem to be made for {what}" in (
         caplog.text
     )
 

@@ -36,7 +36,7 @@ def test_lenses_bend_as_the_manual_says(tmp_path):
 
 def test_distortion_is_taken_out(tmp_path):
     photos = load_photos(write_metashape(tmp_path, scene(), calibration(k1=0.01)))
-    assert "lens distortion taken out" in photos.about
+    assert "lens distortion removed" in photos.about
 
 
 def test_the_largest_component_is_read(tmp_path):
@@ -88,14 +88,17 @@ SENSOR = '<sensor id="3" label="unknown" type="frame">'
             "expected one chunk, got 0",
         ),
         (edited(("transform>", "other>")), "xml: expected cameras with a transform, got 11"),
-        (edited((SENSOR, '<sensor id="4">')), "sensor 3 of p_000: expected it among the sensors"),
+        (edited((SENSOR, '<sensor id="4">')), "sensor 3 of p_000: expected a known sensor"),
         (edited((SENSOR, '<sensor id="3" type="fisheye">')), "expected a sensor of type frame"),
-        (edited(("calibration", "other")), "sensor 3 of p_000: expected a calibration, got none"),
+        (edited(("calibration", "other")), "sensor 3 of p_000: expected a calibration, found none"),
         (edited(("<f>11.0</f>", "")), "sensor 3 of p_000: expected a number as f, got nothing"),
         (edited(("<f>11.0", "<f>wide")), "sensor 3 of p_000: expected a number as f, got 'wide'"),
         (edited(("<f>11.0", "<f>-11.0")), "sensor 3 of p_000: expected fl_x between 0 and inf"),
         (edited(("<f>11.0", "<p3>.1</p3><f>11.0")), "expected distortion by k1 to k4, p1 and p2"),
-        (edited(("<f>11.0", "<b2>2</b2><f>11.0")), "p_000: expected pixels with axes square"),
+        (
+            edited(("<f>11.0", "<b2>2</b2><f>11.0")),
+            "p_000: expected pixels with perp",
+        ),
         (edited(('width="12"', 'width="0"')), "sensor 3 of p_000: expected a resolution above 0,"),
         (edited(('width="12"', "")), "sensor 3 of p_000: expected a number as width, got nothing"),
         (edited(('width="12"', 'width="9"')), r"p_000.png: expected a picture of the shape 9x8"),

@@ -48,7 +48,7 @@ def test_cameras_of_larger_pictures(tmp_path):
         ),
         (
             lambda f: (f / "keyframes" / "corrected_cameras" / "p_003.json").write_text("{"),
-            "p_003.json: broken JSON in line 1",
+            "p_003.json: invalid JSON in line 1",
         ),
         (
             lambda f: (f / "keyframes" / "corrected_images").rename(f / "keyframes" / "images"),

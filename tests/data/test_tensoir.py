@@ -61,7 +61,7 @@ def two_lights(folder):
         (meta(imw=13), r"metadata\.json: expected pictures of 13x8 pixels .*, got 12x8"),
         (
             lambda f: (f / "train_001" / "metadata.json").write_text("{"),
-            "metadata.json: broken JSON",
+            "metadata.json: invalid JSON",
         ),
         (
             lambda f: [(f / f"train_00{v}" / "rgba_sunset.png").unlink() for v in range(5)],

@@ -71,7 +71,7 @@ def test_truth_that_is_not_there(tmp_path):
         ({"alpha": np.zeros(3, np.uint8)}, r"expected an array alpha \[H, W\]"),
         ({"albedo": np.zeros((HEIGHT, WIDTH))}, r"expected finite albedo of shape \[4, 6, 3\],"),
         ({"roughness": np.full((HEIGHT, WIDTH), np.nan)}, "expected finite roughness"),
-        ({"albedo": np.array([object()])}, "expected an npz file, could not read it: .*pickle"),
+        ({"albedo": np.array([object()])}, "this npz file could not be read: .*pickle"),
     ],
 )
 def test_broken_truth(tmp_path, change, message):
@@ -122,7 +122,7 @@ def test_points(tmp_path):
         ({"vertices": np.eye(3)}, r"expected an array points \[P, 3\], got vertices \[3, 3\]"),
         ({"points": np.zeros((2, 2))}, r"got points \[2, 2\]"),
         ({"points": np.zeros((0, 3))}, r"got points \[0, 3\]"),
-        ({"points": np.full((2, 3), np.inf)}, "points hold NaN or infinity"),
+        ({"points": np.full((2, 3), np.inf)}, "points contain NaN or infinity"),
         ({}, "got no arrays"),
     ],
 )
@@ -209,7 +209,7 @@ def test_truth_is_shrunk_by_coverage(tmp_path):
 @pytest.mark.parametrize(
     ("file", "picture", "message"),
     [
-        ("albedo", gray(1, width=5), "expected 6x4 pixels like the photograph's, got 5x4"),
+        ("albedo", gray(1, width=5), "expected 6x4 pixels as in the photograph, got 5x4"),
         ("normal", gray(1)[..., 0], "expected a picture with 3 or 4 channels, got 1"),
     ],
 )

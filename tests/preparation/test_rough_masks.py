@@ -98,7 +98,7 @@ def test_of_plain_objects_silhouettes_alone_tell_masks_from_cameras(photos, capl
         found = choose_masks_or_poses(spoilt, distance, "auto", "auto")
     assert not found.refined
     assert found.votes > 1
-    assert "no better with other cameras: the masks are rough" in caplog.text
+    assert "no better with other cameras: the masks are taken to be rough" in caplog.text
     # What is told is believed
     assert choose_masks_or_poses(spoilt, distance, "refined", "auto").refined
     assert choose_masks_or_poses(spoilt, distance, "auto", "given").refined
@@ -115,7 +115,7 @@ def test_jagged_edges_are_not_doubted():
 
 def test_silhouettes_in_which_nothing_lies(photos, tmp_path):
     cfg = preset("fast", tmp_path / "data", tmp_path / "run")
-    with pytest.raises(DataError, match=r"data: .*(share no volume|nothing in common)"):
+    with pytest.raises(DataError, match=r"data: .*(have no common volume|nothing in common)"):
         prepare.find_silhouettes(replace(photos, alpha=torch.zeros_like(photos.alpha)), cfg)
 
 
@@ -129,7 +129,7 @@ def test_preparation_doubts_what_contradicts_and_starts_from_what_agrees(
     cfg = preset("fast", tmp_path, tmp_path / "run")
     with caplog.at_level("INFO"):
         found = prepare.find_silhouettes(spoilt, cfg)
-    assert "of the pixels are doubted" in caplog.text
+    assert "of the pixels are uncertain" in caplog.text
     assert found.shape is not None
     assert found.doubted.any()
     assert not found.edges_given

@@ -103,7 +103,7 @@ def poses(
     settings = _settings(source, masks, every, config, capture)
     used = {"keep_size": keep_size, "keep_weak": keep_weak}
     if _begin(out, folders, settings, used):
-        log.info(f"{out} is done")
+        log.info(f"{out} is complete")
         return out
     with bar(
         TextColumn("{task.description}"),
@@ -122,7 +122,7 @@ def poses(
         model = scene.own_sizes(Model(model.cameras, ordered, model.points), capture, keep_size)
         model, known = scene.gauge_aligned(model)
         if not known:
-            log.warning("the cameras do not say what is up: the world may be askew")
+            log.warning("the world may be tilted: the cameras do not show what is up")
         names = [image.name for image in model.images]
         centres = np.stack([image.centre for image in model.images])
         for gap in gaps(centres, names, GAP):
@@ -177,7 +177,7 @@ def photographs_of(
         photographs.require_ffmpeg()
         stamp = [source.name, source.stat().st_size, source.stat().st_mtime, every]
         if steps.recorded(folders.work, FRAMES) != stamp:
-            log.info(f"{source}: choosing frames")
+            log.info(f"{source}: selecting frames")
             steps.forget(folders.work, FRAMES)
             shutil.rmtree(folders.frames, ignore_errors=True)
             photographs.write_frames(source, folders.frames, every)
@@ -185,7 +185,7 @@ def photographs_of(
         return sorted(folders.frames.glob("*.jpg")), [], 0
     if every is not None:
         raise DataError(
-            f"{source}: every is for videos ({' '.join(photographs.SUFFIXES)})", "every"
+            f"{source}: every applies to videos only ({' '.join(photographs.SUFFIXES)})", "every"
         )
     if not source.is_dir():
         raise DataError(f"{source}: expected a folder of photographs or a video")
@@ -254,10 +254,10 @@ def _search(
     do(MATCHES, structure.match, structure.pair_count(folders))
     still, matching = pose_validation.still(database.verified_pairs(folders.database))
     if still > STILL_SHARE * matching:
-        stands = f"the background stands still in {still} of {matching} pairs"
+        stands = f"the background is static in {still} of {matching} pairs"
         if capture.masks is None:
             raise StillBackground(stands)
-        raise DataError(f"{stands}: masks hold a part of it, make them tighter", "masks")
+        raise DataError(f"{stands}: the masks include part of it, so make them tighter", "masks")
     do(MODELS, structure.place, total)
     return unreadable
 
@@ -299,8 +299,8 @@ def _judge(capture: Capture, folders: Folders, unreadable: dict[int, str]) -> Fo
     if len(placed) < PLACED_SHARE * len(reports):
         missing = [f"{r.name} ({r.reason})" for r in reports if not r.placed]
         raise DataError(
-            f"only {len(placed)} of {len(reports)} photographs could be placed: take more of them, "
-            f"closer to one another, all of the same still object; not placed: {_some(missing)}"
+            f"only {len(placed)} of {len(reports)} photographs were registered. Take more, "
+            f"closer together, and do not move the object. Not registered: {_some(missing)}"
         )
     return Found(models[0], weak, reports)
 
@@ -321,12 +321,12 @@ def _say(capture: Capture, found: Found, total: int, keep_weak: bool) -> None:
     shares = [f"{lens.focal[0] / lens.width:.2f}" for lens in lenses[:NAMED]]
     cameras = "one camera" if len(lenses) == 1 else f"{len(lenses)} cameras"
     log.info(
-        f"cameras: {len(model.images)} of {total} placed, {model.error:.2f} pixels, focal length "
-        f"{', '.join(shares)} of the longer side ({cameras})"
+        f"cameras: {len(model.images)} of {total} registered, mean reprojection error "
+        f"{model.error:.2f}, focal length {', '.join(shares)} of the longer side ({cameras})"
     )
     missing = [f"{r.name} ({r.reason})" for r in reports if not r.placed]
     if missing:
-        log.warning(f"not placed: {_some(missing)}")
+        log.warning(f"not registered: {_some(missing)}")
     index = {name: i for i, name in enumerate(capture.pictures)}
     weak = [
         f"{capture.photographs[index[i.name]].path.name} ({found.weak[i.number]})"
@@ -336,14 +336,14 @@ def _say(capture: Capture, found: Found, total: int, keep_weak: bool) -> None:
     if weak:
         fate = "kept" if keep_weak else "left out (keep_weak keeps them)"
         log.warning(
-            f"{len(weak)} may be off by degrees, {fate}: {_some(weak)}; "
-            "photograph that side again with more overlap",
+            f"{len(weak)} may be off by degrees, {fate}: {_some(weak)}; photograph that side "
+            "again with more overlap",
             extra={"arguments": ("keep_weak",)},
         )
 
 
 def _aside(unread: list[str], doubles: int) -> str:
-    told = f"; {doubles} came in two formats, one is taken" if doubles else ""
+    told = f"; {doubles} exist in two formats, one is used" if doubles else ""
     return told + (f"; {len(unread)} could not be read: {_some(unread)}" if unread else "")
 
 

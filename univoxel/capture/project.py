@@ -62,7 +62,7 @@ def look_at(path: Path) -> Given:
     elif path.is_dir():
         files, _, _ = find_photographs(path)
     else:
-        came = "a file of another kind" if path.exists() else "nothing there"
+        came = "another kind of file" if path.exists() else "nothing there"
         raise DataError(f"{path}: expected a folder of photographs or a video, got {came}")
     return Given(path, "photographs", [(file.name, file.stat().st_size) for file in files])
 
@@ -112,10 +112,10 @@ def _difference(before: Sequence[tuple[str, int]], now: Sequence[tuple[str, int]
         if name not in old:
             return f"{name} was not part of it"
         if name not in new:
-            return f"{name} is not there now"
+            return f"{name} is missing now"
         if old[name] != new[name]:
-            return f"{name} is another file now"
-    return "they came in another order"
+            return f"{name} has changed since"
+    return "their order has changed"
 
 
 def _words(files: Sequence[tuple[str, int]]) -> str:

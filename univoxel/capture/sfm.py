@@ -77,12 +77,12 @@ def run(request: Request, log: Path, done: Callable[[], int] | None = None) -> I
             yield count()
             if time.monotonic() - begin > limit:
                 raise ProcessFailed(
-                    f"{request.step}: pycolmap was stopped after {request.seconds:.0f} seconds"
+                    f"{request.step}: pycolmap was stopped after {request.seconds:.0f} s"
                 )
     if process.returncode:
-        said = guard.last_words(log.read_bytes()) or "it said nothing"
+        said = guard.last_words(log.read_bytes()) or "no message"
         raise ProcessFailed(
-            f"{request.step}: pycolmap ended with {process.returncode}: {said} (see {log})"
+            f"{request.step}: pycolmap failed ({process.returncode}): {said} (see {log})"
         )
     yield count()
 

@@ -69,7 +69,7 @@ class BatchOptions:
             return changed(config, self.changes)
         if (self.preset, self.light) != ("auto", "hybrid"):
             raise UserError(
-                f"expected config or preset and light, got both: {self.config} says them", "config"
+                f"expected config or preset and light, got both: {self.config} sets them", "config"
             )
         config = load_config(self.config)
         minutes = config.minutes if self.minutes is None else self.minutes
@@ -131,7 +131,7 @@ def batch(asked: BatchOptions, threads: int | None = None) -> list[SceneResult]:
     unknown = [step for step in asked.steps if step not in choices.BATCH_STEPS]
     if unknown or not asked.steps:
         got = ", ".join(unknown) or "none"
-        raise UserError(f"steps must be of {', '.join(choices.BATCH_STEPS)}, got {got}", "steps")
+        raise UserError(f"steps must be among {', '.join(choices.BATCH_STEPS)}, got {got}", "steps")
     numbers = {"jobs": asked.jobs, "threads": threads}
     numbers |= {"tries": asked.tries, "samples": asked.samples}
     for name, number in numbers.items():
@@ -142,7 +142,7 @@ def batch(asked: BatchOptions, threads: int | None = None) -> list[SceneResult]:
     if asked.scheduler is None:
         here = (machine.cores(), machine.memory())
         jobs, threads = share(known.values(), config, *here, jobs, threads)
-        log.info("scenes at once: %d, threads of each: %d", jobs, threads)
+        log.info("%d scenes at once, %d threads each", jobs, threads)
     elif jobs is not None:
         raise UserError("expected jobs or scheduler, got both", "jobs", "scheduler")
     every = [job_of(name, data, asked, threads) for name, data in known.items()]
@@ -219,8 +219,8 @@ def check(results: Sequence[SceneResult]) -> None:
     failed = [result.name for result in results if result.state != "done"]
     if failed:
         raise ProcessFailed(
-            f"{len(failed)} of {len(results)} scenes failed ({', '.join(failed)}): "
-            "the same command tries them again"
+            f"{len(failed)} of {len(results)} scenes failed ({', '.join(failed)}): run the same "
+            "command again to retry them"
         )
 
 
@@ -229,7 +229,7 @@ def table(results: Sequence[SceneResult]) -> Table:
     from rich.table import Table
 
     rows = Table("scene", "state", "verdict")
-    for head in ("novel views, dB", "doubt of albedo", "seconds"):
+    for head in ("novel views, dB", "albedo uncertainty", "seconds"):
         rows.add_column(head, justify="right")
     rows.add_column("error")
     for r in results:

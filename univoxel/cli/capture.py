@@ -83,17 +83,21 @@ def command(asked: CaptureOptions) -> int:
     page, DIR/index.html. Finished steps are kept: after an interruption, run the same command again
     to resume.
     """
+    from univoxel.run import load_verdict
+
     check_minutes(asked.minutes)
     where, until = (asked.photographs, asked.out), asked.until
     masks = {name: getattr(asked, name) for name in ("masks", "network", "box", "keep_table")}
     training = {name: getattr(asked, name) for name in ("preset", "light", "minutes")}
     if until == "page":
         made = capture(*where, **masks, **training, changes=asked.changes)
+        if verdict := load_verdict(made.run):
+            log.info("\n".join(verdict.lines()))
         print(made.page)
         print(made.mesh)
         return code_of(made.run)
     if (*training.values(), asked.changes) != ("auto", "hybrid", None, ()):
-        raise UserError(f"--until {until}: --preset, --light, --minutes, --set come after it")
+        raise UserError(f"--until {until}: --preset, --light, --minutes and --set have no effect")
     print(find_data(*where, **masks, until=until))
     return 0
 
@@ -102,9 +106,9 @@ def command(asked: CaptureOptions) -> int:
 class PicturesConfig:
     """The pictures of a capture."""
 
-    frames: int = setting(8, "of an orbit around the object, under each map", least=1)
-    resolution: int = setting(512, "of their sides", unit="pixels", least=1)
-    samples: int = setting(choices.SAMPLES, "of the light, per pixel", least=1)
+    frames: int = setting(8, "frames of an orbit, for each environment map", least=1)
+    resolution: int = setting(512, "width and height of the images", unit="pixels", least=1)
+    samples: int = setting(choices.SAMPLES, "light samples per pixel", least=1)
 
     __post_init__ = check_settings
 
@@ -166,7 +170,10 @@ def capture(
 
     asked = CaptureOptions(Path(photographs), Path(out), **options)
     if asked.until != "page":
-        raise UserError(f"until: expected page, got {asked.until}: see `find_data`", "until")
+        raise UserError(
+            f"until: expected page, got {asked.until}: call `find_data`",
+            "until",
+        )
     given, project = look_at(asked.photographs), Project(asked.out)
     training = chosen(asked.preset, asked.minutes, project.cut, project.run, asked.light)
     training = changed(training, asked.changes)
@@ -182,7 +189,7 @@ def capture(
     else:
         if not (project.run / FILE).exists():
             seconds = slowdown(training) * sum(map(expected_seconds, training.stages))
-            said = f"training takes about {duration(seconds)} on this machine"
+            said = f"the training takes about {duration(seconds)} on this machine"
             log.info(f"{said}; cameras and masks come on top")
         scene = _find_cameras(project, given, asked, config)
         data = _find_masks(project, scene, asked)
@@ -211,7 +218,7 @@ def find_data(
     asked = CaptureOptions(Path(photographs), Path(out), **options)
     given, project = look_at(asked.photographs), Project(asked.out)
     if given.kind == "run":
-        raise UserError(f"{given.path} is a trained run: there are cameras and masks", "until")
+        raise UserError(f"{given.path} is a trained run with cameras and masks", "until")
     _check_machine(given, asked)
     begin(project, given)
     _check_network(project, asked)
@@ -224,7 +231,7 @@ def _say(step: str, what: str) -> None:
 
 
 def _skip(step: str, what: Path) -> None:
-    _say(step, f"there already, {what}")
+    _say(step, f"kept from before, {what}")
 
 
 def _check_unused(given: Given, asked: CaptureOptions, training: TrainConfig) -> None:
@@ -235,7 +242,7 @@ def _check_unused(given: Given, asked: CaptureOptions, training: TrainConfig) ->
     if asked.fingerprint != AUTO or training != usual:
         raise UserError(
             f"{given.path} is a trained run: masks, network, box, preset, minutes, light and set "
-            "come too late",
+            "have no effect on it",
             *("masks", "network", "box", "preset", "minutes", "light", "set"),
         )
 
@@ -268,7 +275,7 @@ def _check_network(project: Project, asked: CaptureOptions) -> None:
 
     def other(before: str) -> ExistingFile:
         return ExistingFile(
-            f"{project.out} holds cameras found with masks of network={before}: choose another out",
+            f"{project.out} holds cameras found with network={before}: choose another out",
             *("network", "out"),
         )
 
@@ -293,14 +300,14 @@ def _find_cameras(
         _skip("cameras", done)
         return done
     if not files.recorded(project.out, TURNED):
-        _say("cameras", f"of {given.path}")
+        _say("cameras", f"from {given.path}")
         try:
             return poses(given.path, done, config=config)
         except StillBackground as error:
-            log.info(f"{error.seen}: the object was turned before a still camera, so masks first")
+            log.info(f"{error.seen}, as on a turntable: masks are made first")
             files.finish(project.out, TURNED, True)
     first = _masks_before_cameras(project, given, asked)
-    _say("cameras", f"of what masks show of {given.path}")
+    _say("cameras", f"from the masked part of {given.path}")
     return poses(given.path, done, masks=first, config=config)
 
 
@@ -324,11 +331,11 @@ def _masks_before_cameras(project: Project, given: Given, asked: CaptureOptions)
         return project.masks
     if masks == choices.DEPTH:
         raise UserError(
-            f"{given.path}: the object was turned before a still camera, so cameras need masks: "
-            f"expected masks={choices.REMBG} or a folder, got {masks}",
+            f"{given.path}: the background is static, as on a turntable, so finding cameras needs "
+            f"masks: expected masks={choices.REMBG} or a folder, got {masks}",
             "masks",
         )
-    _say("masks", "of single photographs, from a network")
+    _say("masks", "from a network, for each photograph")
     masked = mask_network(asked.network)
     pictures, _, _ = photographs_of(given.path, folders_of(project.scene))
     require_readers(pictures)
@@ -363,8 +370,8 @@ def _find_masks(project: Project, scene: Path, asked: CaptureOptions) -> Path:
         made = {k: " ".join(map(str, v)) if k == "box" else v for k, v in made.items()}
         words = ", ".join(f"{name}={value}" for name, value in made.items())
         return ExistingFile(
-            f"{project.cut} holds photographs with {words}: to make them anew, remove it "
-            f"and {project.run}",
+            f"{project.cut} holds photographs with {words}: to make them again, remove it and "
+            f"{project.run}",
             *made,
         )
 
@@ -376,8 +383,8 @@ def _find_masks(project: Project, scene: Path, asked: CaptureOptions) -> Path:
     if masks == AUTO and not turned and _have_masks(project, scene):
         if asked.box is not None:
             raise UserError(
-                f"{scene} brings masks, which are trained on as they are: with a box expected "
-                f"masks={choices.REMBG}, {choices.DEPTH} or their folder, got {masks}",
+                f"{scene} has masks, which training uses unchanged: with a box, expected "
+                f"masks={choices.REMBG}, {choices.DEPTH} or a folder of masks, got {masks}",
                 "masks",
             )
         _skip("masks", scene)
@@ -387,7 +394,7 @@ def _find_masks(project: Project, scene: Path, asked: CaptureOptions) -> Path:
         source = scene / "masks"  # those that the cameras were found with
     else:
         source = _network_or_depth(asked.network) if masks == AUTO else asked.masks
-    words = {choices.REMBG: "from a network", choices.DEPTH: "from depth alone"}
+    words = {choices.REMBG: "from a network", choices.DEPTH: "from depth only"}
     _say("masks", words.get(str(source), f"from {source}"))
     return cutout(
         *(scene, project.cut, source),
@@ -406,7 +413,7 @@ def _network_or_depth(name: choices.NetworkName) -> str:
     except MissingExtra as missing:
         if name != choices.NETWORK:  # which nobody names for nothing
             raise
-        log.info(f"no network is installed, so depth alone tells the object ({missing})")
+        log.info(f"no mask network is installed, so the object is found by depth only ({missing})")
         return choices.DEPTH
     return choices.REMBG
 
@@ -438,12 +445,12 @@ def _train(wanted: TrainConfig, on_progress: Callable[[TrainingProgress], None] 
     if done or begun:
         _check_trained(wanted, done)
     if not done:
-        _say("training", "goes on" if begun else f"on {data}")
+        _say("training", "resumed" if begun else f"on {data}")
         return train(wanted, resume=begun, on_progress=on_progress)
     _skip("training", run)
     newest = max((p.stat().st_mtime_ns for p in data.rglob("*.png")), default=0)
     if newest > (run / FILE).stat().st_mtime_ns:
-        log.warning(f"photographs in {data} have changed since: to train anew, remove {run}")
+        log.warning(f"photographs in {data} have changed: to train again, remove {run}")
     return run
 
 
@@ -459,8 +466,8 @@ def _check_trained(wanted: TrainConfig, done: bool) -> None:
         same = False
     if not same:
         raise ExistingFile(
-            f"{wanted.out} was trained with another preset, minutes, light or set: to train anew, "
-            "remove it, or choose another out",
+            f"{wanted.out} was trained with another preset, minutes, light or set: to train "
+            "again, remove it, or choose another out",
             *("preset", "minutes", "light", "set", "out"),
         )
 
@@ -503,7 +510,7 @@ def _picture(project: Project, run: Path, config: PicturesConfig) -> None:
     try:
         evaluate(run, save=folder / "test", json=measures)
     except DataError as error:  # such as a run whose photographs are elsewhere now
-        log.warning(f"no measures: {error}")
+        log.warning(f"no metrics: {error}")
     return None
 
 
@@ -514,8 +521,8 @@ def _write_page(project: Project, given: Given, run: Path) -> None:
     from univoxel.output.page import write_page
 
     beside = [
-        ("the mesh with its materials", project.mesh),
-        ("pictures with their layers", project.pictures),
+        ("the mesh with materials", project.mesh),
+        ("images with their layers", project.pictures),
         ("the masks, worst first", project.cut / "masks.html"),
     ]
     named = [
@@ -530,7 +537,7 @@ def _write_page(project: Project, given: Given, run: Path) -> None:
         run,
         project.page,
         title=project.out.absolute().name,
-        notes=f"Made of {given.words}. Beside this page lie {', '.join(named)}.",
+        notes=f"Made from {given.words}. The same folder holds {', '.join(named)}.",
         measures=in_words(known),
         **page_options(run),
     )

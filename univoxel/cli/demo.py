@@ -18,10 +18,10 @@ MINUTES = 2.0  # of training: the whole takes less than twice that on two cores
 
 TITLE = "Half an avocado and a bell pepper"
 NOTES = (
-    "Trained on {photos} photographs by this machine's processor. Beside this page lie the run "
-    "(run/), its surface (mesh.ply), the test views as layers beside their truth "
-    "(test/contact_sheet.png), and the test views under two maps that training never saw "
-    "(relight/)."
+    "Trained on {photos} photographs on this machine's CPU. The same folder holds the run "
+    "(run/), its surface (mesh.ply), the test views beside the ground truth "
+    "(test/contact_sheet.png), and the test views under two environment maps that training "
+    "never saw (relight/)."
 )
 
 

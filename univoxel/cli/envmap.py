@@ -32,8 +32,8 @@ def command(asked: EnvmapOptions) -> None:
     found = envmap(**vars(asked))
     print(asked.out)
     if found:
-        print(f"grey ball under it: PSNR {found.ball_psnr:.1f} dB, a scale per channel")
-        print(f"mirror ball under it: PSNR {found.mirror_psnr:.1f} dB")
+        print(f"diffuse sphere under it: PSNR {found.ball_psnr:.1f} dB, after a scale per channel")
+        print(f"chrome sphere under it: PSNR {found.mirror_psnr:.1f} dB")
         print(f"brightest directions: {found.brightest_degrees:.1f} degrees apart")
 
 

@@ -60,7 +60,7 @@ class EvaluateOptions:
                 "bounces",
             )
         if self.fit_light and self.light_of is not None:
-            raise UserError("light_of and fit_light exclude one another", "light_of", "fit_light")
+            raise UserError("expected light_of or fit_light, got both", "light_of", "fit_light")
 
 
 @parsing.takes(EvaluateOptions)
@@ -150,12 +150,12 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
 
 
 def table(result: dict[str, float | int | None]) -> Table:
-    """The measures as the command prints them."""
+    """The metrics that have a value, as the command prints them."""
     from rich.table import Table
 
     from univoxel.evaluation.measures import MEASURES
 
-    rows = Table("measure", "meaning", "value", title="Test views")
+    rows = Table("key", "metric", "value", title="Test views")
     rows.columns[2].justify = "right"
     known = MEASURES
     if "full_psnr" in result:
@@ -163,9 +163,8 @@ def table(result: dict[str, float | int | None]) -> Table:
 
         known = MEASURES | FULL_MEASURES
     for key, meaning in known.items():
-        value = result[key]
-        text = "-" if value is None else f"{value:.4g}" if isinstance(value, float) else f"{value}"
-        rows.add_row(key, meaning, text)
+        if (value := result[key]) is not None:
+            rows.add_row(key, meaning, f"{value:.4g}" if isinstance(value, float) else f"{value}")
     return rows
 
 
@@ -179,7 +178,7 @@ def _at_full_size(
     try:
         train = photos_of(run, data, "train")
     except (UserError, OSError) as error:  # views are the model's alone
-        log.info("full size: no photographs nearby: %s", error)
+        log.info("full size: novel views without photographs: %s", error)
         train = None
     return dict(measure_full_size(scene, run, photos, train, save))
 

@@ -92,8 +92,8 @@ def require_levels(faces: int, lods: int) -> None:
     coarsest = faces // FEWER**lods
     if coarsest < LEAST_FACES:
         raise UserError(
-            f"export: lods={lods} of {faces} faces leave {coarsest} in the coarsest level, expected"
-            f" at least {LEAST_FACES}",
+            f"export: lods={lods} with {faces} faces leaves {coarsest} in the coarsest level, "
+            f"expected at least {LEAST_FACES}",
             "lods",
         )
 

@@ -106,9 +106,9 @@ def info(asked: InfoOptions) -> dict[str, Any]:
     found["bytes"] = (run / FILE).stat().st_size
     found["cameras"] = camera_check(scene, run)
     verdict = load_verdict(run)
-    unknown = "Result: unfinished, training has not ended. What helps: train it with --resume"
+    unknown = "Result: unfinished, training has not ended. To improve it: use --resume"
     if (run / "trust.txt").exists():
-        unknown = "Result: not judged, because a version before 0.3 trained it"
+        unknown = "Result: unknown, because a version before 0.3 trained the run"
     found["said"] = unknown if verdict is None else verdict.sentence()
     found["result"] = None if verdict is None else as_json(verdict)
     for path in (json, picture):
@@ -134,7 +134,7 @@ def camera_check(scene: Scene, run: Path) -> dict[str, Any] | None:
         photos = photos_of(run, split="train")
         used = scene.registered(photos).cameras
     except UserError as error:
-        log.info("cameras are not checked: %s", error)
+        log.info("cameras were not checked: %s", error)
         return None
     matches = find_matches(photos, mask_distances(photos.coverage(), photos.cameras))
     given, after = (agreement(cameras, matches) for cameras in (photos.cameras, used))
@@ -204,7 +204,7 @@ def tables(found: dict[str, Any]) -> Iterable[Table | str]:
         share = f"{part['bytes'] / whole:.1%}"
         table.add_row(name, f"{part['parameters']:,}", f"{part['bytes']:,}", share)
     table.add_section()
-    table.add_row("all", f"{found['parameters']:,}", f"{found['bytes']:,}", "with the file's head")
+    table.add_row("all", f"{found['parameters']:,}", f"{found['bytes']:,}", "with the file header")
     yield table
     grid = found["grid"]
     table = Table("size", "value", title="Sizes")
@@ -212,16 +212,16 @@ def tables(found: dict[str, Any]) -> Iterable[Table | str]:
     x, y, z = grid["size"]
     table.add_row("nodes of the grid", f"{x} x {y} x {z}")
     table.add_row("voxel, world units", f"{grid['voxel_size']:.4g}")
-    table.add_row("nodes with a distance of their own", f"{grid['share_with_distance']:.1%}")
+    table.add_row("nodes with their own distance", f"{grid['share_with_distance']:.1%}")
     table.add_row("nodes with features", f"{grid['share_with_features']:.1%}")
     table.add_row("feature channels", f"{found['channels']}")
-    table.add_row("of them for materials", f"{found['material_channels']}")
-    table.add_row("hidden units of a layer", f"{found['hidden']}")
-    table.add_row("lobes of light", "-" if found["lobes"] is None else f"{found['lobes']}")
+    table.add_row("features used for materials", f"{found['material_channels']}")
+    table.add_row("hidden units per layer", f"{found['hidden']}")
+    table.add_row("light lobes", "-" if found["lobes"] is None else f"{found['lobes']}")
     yield table
     if found["cameras"] is None:
         return
-    title = "Matched points off their epipolar lines, pixels"
+    title = "Epipolar error of matched points, pixels"
     table = Table("cameras", "median", "90 %", title=title)
     for column in table.columns[1:]:
         column.justify = "right"

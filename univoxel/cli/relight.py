@@ -234,7 +234,7 @@ def relight_to_files(
     paths = [Path(path) for path in envmap] if several else [Path(envmap)]
     if len({path.stem for path in paths}) != len(paths):
         raise UserError(
-            "relight: expected environment maps of different names, got "
+            "relight: expected environment maps with different names, got "
             f"{[str(path) for path in paths]}"
         )
     for kind in animation:

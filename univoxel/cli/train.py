@@ -101,7 +101,7 @@ class TrainOptions:
 
         for field in fields(TrainOptions):
             if field.name not in OWN and (value := getattr(self, field.name)) != field.default:
-                both = f"expected config or {field.name}={value}, got both: {file} says it"
+                both = f"expected config or {field.name}={value}, got both: {file} sets it"
                 raise UserError(both, "config", field.name)
         config = replace(load_config(file), data=Path(self.data), out=Path(self.out))
         return config if self.minutes is None else replace(config, minutes=self.minutes)
@@ -131,7 +131,7 @@ class Train(TrainOptions):
             return "127.0.0.1" if host is None else host, 8080 if port is None else port
         if host is not None or port is not None:
             option = f"--host {host}" if host is not None else f"--port {port}"
-            raise UserError(f"expected --view with {option}, got that alone")
+            raise UserError(f"{option} needs --view")
         return None
 
 

@@ -83,7 +83,7 @@ def train(
     from univoxel.viewer.training import watched
 
     with watched(*view, cfg.out.resolve().name) as spectators, memmap.large_arrays_in(cfg.out):
-        log.info(f"to look at while it trains, in a browser: {spectators.address}")
+        log.info(f"Watch the training in a browser: {spectators.address}")
         return _train(cfg, resume, film, spectators, on_progress)
 
 
@@ -99,7 +99,7 @@ def _train(
     torch.manual_seed(cfg.seed)
     if not resume and (cfg.out / FILE).exists():
         raise ExistingFile(
-            f"{cfg.out} holds a run already: pass resume or another out", "resume", "out"
+            f"{cfg.out} holds a run already: pass resume, or choose another out", "resume", "out"
         )
     kept, outside = kept_photos(cfg.out, "train"), cfg.allow_outside
     photos = load_photos(cfg.data, "train", cfg.downscale, kept=kept, allow_outside=outside)
@@ -158,7 +158,9 @@ def _train(
     )
     made_after_training(scene, pixels.photos, cfg.out, cfg.detail, until)
     for choice in progress.chosen:
-        log.info(choice.sentence)
+        log.debug(choice.sentence)
+    for line in verdict.lines():
+        log.info(line)
     return cfg.out
 
 
@@ -213,7 +215,7 @@ def resumed(cfg: config.TrainConfig) -> tuple[Scene, dict[str, Any]] | None:
         UserError: the checkpoint cannot be read, or it belongs to another configuration.
     """
     if not (cfg.out / FILE).is_file():
-        log.info(f"nothing was saved in {cfg.out} yet: training begins")
+        log.info(f"{cfg.out}: nothing was saved yet, so the training starts from the beginning")
         return None
     scene, state = load_checkpoint(cfg.out)
     config.check_same(cfg)
@@ -233,13 +235,13 @@ def announce(progress: Progress, photos: Photos) -> None:
         log.info(f"{what}: about {duration(whole)} on this machine")
         return
     fits = max(clock.limit - clock.preparation - RESERVE_SECONDS, 0.0) / clock.planned
-    said = f"{what}: about {duration(whole)} on this machine; minutes={cfg.minutes:g} are enough "
+    said = f"{what}: about {duration(whole)} on this machine; minutes={cfg.minutes:g} is enough "
     if fits < 1:
         said += f"for about {fits:.0%} of the steps"
     else:
         said += f"for all steps if cameras and masks take {duration(clock.preparation)}"
     if fits < LEAST:
-        said += f", minutes={math.ceil(whole / 60)} for all of them"
+        said += f"; minutes={math.ceil(whole / 60)} is enough for all of them"
     log.info(said, extra={"arguments": ("minutes",)})
 
 
@@ -332,16 +334,16 @@ def trusted(scene: Scene, photos: Photos) -> Survey | None:
     try:
         return survey(scene, photos, REPORT_POINTS)
     except UserError as error:
-        log.info(f"no trust report: {error}")
+        log.info(f"no uncertainty report: {error}")
         return None
 
 
 def save_trust(
     verdict: Verdict, surveyed: Survey | None, troubles: list[str], cfg: config.TrainConfig
 ) -> None:
-    """Write to the run's trust.txt, and log, how it came out and what photographs leave open."""
+    """Write the verdict and the uncertainty to the run's trust.txt."""
     text = verdict.sentence() + "."
     if surveyed is not None:
-        text += " " + words(numbers(surveyed), troubles)
+        log.debug(uncertain := words(numbers(surveyed), troubles))
+        text += " " + uncertain
     write_text(cfg.out / "trust.txt", text + "\n")
-    log.info(text)

@@ -53,11 +53,11 @@ def command(asked: ViewOptions) -> Path | None:
 
     page = PageOptions(asked.title, asked.envmap, **page_options(asked.run))
     with serving(subject_of(Path(asked.run)), page, asked.host, asked.port) as address:
-        log.info(f"to look at, in a browser: {address} (Ctrl-C ends it)")
+        log.info(f"Open {address} in a browser (Ctrl-C stops the server)")
         try:
             threading.Event().wait()
         except KeyboardInterrupt:
-            log.info("ended")
+            log.info("stopped")
     return None
 
 
@@ -72,7 +72,8 @@ def with_page(run: Path) -> Path:
 
     try:
         page = write_page(run, run / PAGE, **page_options(run))
-        log.info(f"to look at, in a browser: {page}")
+        log.info(f"Page: open {page} in a browser")
+        log.info(f"Next: univoxel view {run}, or univoxel export {run} --mesh FILE.glb")
     except (UserError, OSError) as error:  # the training is done and saved
-        log.warning(f"no page was written: {error}")
+        log.warning(f"the web page was not written: {error}")
     return run

@@ -73,7 +73,7 @@ def reserve(descriptor: int, size: int, place: Path) -> None:
         system.reserve(descriptor, size)
     except OSError as error:
         raise OSError(
-            error.errno, f"no room for {size / 1e9:.1f} GB: {error.strerror}", str(place)
+            error.errno, f"no space left for {size / 1e9:.1f} GB: {error.strerror}", str(place)
         ) from error
 
 
@@ -88,7 +88,7 @@ def mapped(path: Path, offset: int, shape: Sequence[int], dtype: torch.dtype) ->
         OSError: the file cannot be written.
     """
     if offset % dtype.itemsize:
-        raise ValueError(f"{path}: numbers at {offset} are not aligned")
+        raise ValueError(f"{path}: the numbers at offset {offset} are not aligned")
     end = offset + math.prod(shape) * dtype.itemsize
     if (size := path.stat().st_size) < end:  # it would be made longer, with zeros
         raise ValueError(f"{path}: expected {end} bytes, got {size}")

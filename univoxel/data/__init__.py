@@ -77,11 +77,12 @@ def load_photos(
     files = sorted(path.name for path in folder.iterdir())
     raise DataError(
         f"{folder}: expected photographs with their cameras, got "
-        f"{some(files) or 'an empty folder'} (looked for "
-        f"transforms_{split}.json, transforms.json, cameras and images (.bin or .txt) of COLMAP in "
-        f"sparse/0, sparse, colmap/sparse/0 and here, poses_bounds.npy, cameras_sphere.npz, "
-        f"inputs/sfm_scene.json, keyframes/corrected_cameras, XML of Metashape, CSV of "
-        f"RealityCapture, {split}_000/metadata.json)"
+        f"{some(files) or 'an empty folder'}. If these are photographs without cameras, run "
+        f"`univoxel capture {folder} --out DIR` (looked for transforms_{split}.json, "
+        "transforms.json, a COLMAP model (cameras and images, .bin or .txt) in sparse/0, "
+        "sparse, colmap/sparse/0 or here, poses_bounds.npy, cameras_sphere.npz, "
+        "inputs/sfm_scene.json, keyframes/corrected_cameras, Metashape XML, RealityCapture CSV, "
+        f"{split}_000/metadata.json)"
     )
 
 

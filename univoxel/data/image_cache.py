@@ -216,7 +216,7 @@ def keep_photos(photos: Photos, path: Path) -> None:
         with replacing(path) as temporary:
             save_file(tensors, temporary, facts)
     except (OSError, SafetensorError) as error:
-        log.info("photographs are not kept for the next time: %s", error)
+        log.info("prepared photographs could not be stored for the next run: %s", error)
 
 
 def _origin_in(path: Path) -> str | None:

@@ -327,15 +327,15 @@ def measure_full_size(
 
 # By key: what the table says of it
 FULL_MEASURES = {
-    "full_psnr": "at full size: novel views, PSNR of the object after a gain per channel, dB",
-    "full_ssim": "at full size: SSIM",
+    "full_psnr": "full size: novel views, PSNR of the object, dB, a gain per channel",
+    "full_ssim": "full size: SSIM",
     **{
-        f"full_coherence_{k + 1}": f"at full size: coherence, octave {k + 1}"
+        f"full size: coherence, octave {k + 1}": f"at full size: coherence, octave {k + 1}"
         for k in range(OCTAVES)
     },
-    "full_model_psnr": "at full size, without photographs nearby: PSNR, dB",
+    "full_model_psnr": "full size, model only: PSNR, dB",
     **{
-        f"full_model_coherence_{k + 1}": f"at full size, without photographs nearby: octave {k + 1}"
+        f"full_model_coherence_{k + 1}": f"full size, model only: coherence, octave {k + 1}"
         for k in range(OCTAVES)
     },
 }

@@ -179,7 +179,7 @@ def compare(
     roughness_step: float,
 ) -> tuple[Tensor, Tensor]:
     """Mean absolute difference in sRGB of photographs and render, and root mean square of the
-    render's slope by roughness: [P] each, 0 where there is no observation.
+    render's slope by roughness: [P] each, 0 without an observation.
 
     A clipped pixel says only that it was at least so bright.
 
@@ -326,31 +326,31 @@ def words(figures: dict[str, float], troubles: list[str]) -> str:
         troubles: what went wrong in training, from its state.
     """
     sentences = [
-        f"Doubt of albedo {figures['doubt_albedo']:.2f}, of roughness "
-        f"{figures['doubt_roughness']:.2f} in the mean over the surface (0: well determined, 1: a "
+        f"Uncertainty of the albedo {figures['doubt_albedo']:.2f}, of the roughness "
+        f"{figures['doubt_roughness']:.2f}, averaged over the surface (0: well determined, 1: a "
         "guess)."
     ]
     shares = {
         "few_views": f"is seen by fewer than {FEW_VIEWS} cameras: its materials are a guess",
-        "one_side": f"is seen from about one direction, within {ONE_SIDE:g} degrees of it: "
-        "colour and highlight are hard to tell apart there",
-        "clipped": "is clipped in most photographs: shorter exposures would help",
-        "black": "is black in most photographs: more light would help",
-        "shut": f"gets less than {MIN_VISIBILITY:.0%} of its light from outside: what parts of "
-        "the object send to each other may be left in its albedo",
-        "disagreeing": f"differs from its photographs by more than {MAX_DISAGREEMENT:g} in "
-        "sRGB: its surface, material or light is wrong",
-        "dull": "shows no highlight that tells its roughness",
+        "one_side": f"is seen only within {ONE_SIDE:g} degrees of one direction: colour and "
+        "highlight cannot be separated there",
+        "clipped": "is overexposed in most photographs: use shorter exposures",
+        "black": "is black in most photographs: use more light",
+        "shut": f"gets less than {MIN_VISIBILITY:.0%} of its light from outside: light reflected "
+        "between parts of the object may remain in its albedo",
+        "disagreeing": f"differs from its photographs by more than {MAX_DISAGREEMENT:g} in sRGB: "
+        "shape, material or light is wrong",
+        "dull": "shows no highlight, so its roughness is a guess",
     }
     for name, text in shares.items():
         if figures[name] >= MIN_SHARE:
             sentences.append(f"{figures[name]:.0%} of the surface {text}.")
     sentences.append(
-        "Albedo and light share a factor that photographs cannot fix: compare albedos with one "
-        "another, not with a colour chart."
+        "Photographs cannot separate the brightness of albedo and light: compare albedos with "
+        "one another, not with a colour chart."
     )
     if troubles:
-        sentences.append(f"Training met trouble {len(troubles)} times, the last in {troubles[-1]}.")
+        sentences.append(f"Training recovered {len(troubles)} times, last in {troubles[-1]}.")
     return " ".join(sentences)
 
 
@@ -381,17 +381,15 @@ COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", 
 class AdviceConfig:
     """How directions for more photographs are chosen."""
 
-    most: int = setting(6, "directions that are advised", least=1)
+    most: int = setting(6, "maximum number of directions", least=1)
     least: float = setting(
         0.006,
-        "worth of a photograph from which on it is advised: the share of the surface, times its "
-        "doubt, that it would show as well as many photographs",
+        "minimum worth of a photograph: the share of the surface, times its uncertainty, that "
+        "the photograph would resolve",
         least=0,
         most=1,
     )
-    share: float = setting(
-        0.5, "of the best one's worth; less is not worth the walk", least=0, most=1
-    )
+    share: float = setting(0.5, "minimum worth relative to the best photograph", least=0, most=1)
 
     __post_init__ = check_settings
 

@@ -254,8 +254,8 @@ def every_nth(photos: Photos, trained: list[str], every: int) -> Photos:
     chosen = sorted([*photos.names, *trained])[::every]
     if seen := sorted(set(chosen) & set(trained)):
         raise UserError(
-            f"test_every {every} asks for {len(seen)} photographs that were trained on, such as "
-            f"{seen[0]}: novel views are those that training has not seen",
+            f"test_every {every} selects {len(seen)} photographs that were trained on, such as "
+            f"{seen[0]}: test views must be photographs that training did not see",
             "test_every",
         )
     return photos.of(torch.tensor([photos.names.index(name) for name in chosen]))
@@ -278,8 +278,8 @@ def _check_size(photos: Photos, view: int, picture: Tensor, what: str) -> None:
     width, height = photos.cameras.size(view)
     if picture.shape != (height, width):
         raise DataError(
-            f"{photos.folder}: expected {what} to have {width}x{height} pixels like the test "
-            f"view, got {picture.shape[1]}x{picture.shape[0]}"
+            f"{photos.folder}: expected {what} with {width}x{height} pixels as in the test view, "
+            f"got {picture.shape[1]}x{picture.shape[0]}"
         )
 
 
@@ -298,17 +298,17 @@ def _check_size(photos: Photos, view: int, picture: Tensor, what: str) -> None:
 MEASURES = {
     "nvs_psnr": "novel views, PSNR, dB",
     "nvs_ssim": "novel views, SSIM",
-    "albedo_psnr_raw": "albedo PSNR, dB, as it is",
+    "albedo_psnr_raw": "albedo PSNR, dB, unscaled",
     "albedo_psnr_1ch": "albedo PSNR, dB, one scale",
     "albedo_psnr_3ch": "albedo PSNR, dB, a scale per channel",
-    "albedo_psnr_fg": "albedo PSNR, dB, a scale per channel, mask only",
-    "roughness_mse": "roughness MSE in the mask",
+    "albedo_psnr_fg": "albedo PSNR, dB, a scale per channel, inside the mask",
+    "roughness_mse": "roughness MSE, inside the mask",
     "relit_psnr": "relit PSNR, dB, albedo with a scale per channel",
-    "relit_psnr_raw": "relit PSNR, dB, albedo as it is",
-    "normal_mae_deg": "normals, mean error in the mask, degrees",
+    "relit_psnr_raw": "relit PSNR, dB, albedo unscaled",
+    "normal_mae_deg": "normals, mean error inside the mask, degrees",
     "chamfer": "Chamfer distance, world units",
-    "trust_spearman": "rank correlation of the albedo's doubt with its error",
-    "trust_spearman_roughness": "rank correlation of the roughness's doubt with its error",
+    "trust_spearman": "rank correlation of albedo uncertainty and error",
+    "trust_spearman_roughness": "rank correlation of roughness uncertainty and error",
     "train_seconds": "training, seconds",
     "threads": "threads in training",
     "peak_rss_mb": "peak memory in training, MB",

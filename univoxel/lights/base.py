@@ -57,7 +57,7 @@ def total_variation(log_map: Tensor) -> Tensor:
 MOST_DIRECTIONS = 1 << 16  # that light is summed up over: memory of a batch grows with them
 MOST_LAYERS = 32  # of a network: without shortcuts deeper ones do not learn
 MOST_ROWS = 1 << 13  # of a map
-KIND = about("name of this light, by which config.json tells it from the others")
+KIND = about("name of the lighting model in config.json")
 
 
 @dataclass(frozen=True)

@@ -201,11 +201,11 @@ PAIRS = 500  # of cameras, whose axes are tried
 class Table:
     """The axis about which an object was turned, while camera and light stood still."""
 
-    point: Vec3 = field(metadata=about("of the axis", unit="world units"))
-    axis: Vec3 = field(metadata=about("unit, upwards"))
-    start: Vec3 = field(metadata=about("unit, across the axis: from it to the camera"))
+    point: Vec3 = field(metadata=about("a point of the axis", unit="world units"))
+    axis: Vec3 = field(metadata=about("unit vector, pointing up"))
+    start: Vec3 = field(metadata=about("unit vector from the axis to the camera"))
     eyes: tuple[Vec3, ...] = setting(
-        (), "where its cameras stood; none: all stood around this axis"
+        (), "positions of its cameras; empty: all stood around this axis"
     )
 
     def __post_init__(self) -> None:
@@ -213,8 +213,8 @@ class Table:
         lengths = float((axis.norm() - 1).abs().maximum((start.norm() - 1).abs()))
         if not max(lengths, float((axis @ start).abs())) < 1e-3:
             raise ConfigError(
-                f"{type(self).__name__}: axis and start must be unit vectors across each other, "
-                f"got {self.axis} and {self.start}"
+                f"{type(self).__name__}: axis and start must be perpendicular unit vectors, got "
+                f"{self.axis} and {self.start}"
             )
 
     @staticmethod
@@ -256,7 +256,7 @@ class Turntable(Table):
     show its underside, has another axis for the photographs since then.
     """
 
-    others: tuple[Table, ...] = setting((), "each with the eyes of its own cameras")
+    others: tuple[Table, ...] = setting((), "other tables, each with its own eyes")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -356,8 +356,8 @@ class _Once(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:
         raise RuntimeError(
-            f"{ctx.name}: cannot differentiate twice: gradients of this op have none themselves, "
-            'those of its reference have: univoxel.ops.use_backend("reference")'
+            f"{ctx.name}: cannot differentiate twice: this op has no second derivatives, but its "
+            'reference does: univoxel.ops.use_backend("reference")'
         )
 
 

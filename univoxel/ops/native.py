@@ -114,14 +114,14 @@ def serves(tensor: Tensor) -> bool:
     fits = tensor.device.type == "cpu" and tensor.dtype in (torch.float32, torch.float64)
     if _backend == "native" and not fits:
         raise RuntimeError(
-            f"the native backend serves float32 and float64 on the cpu, got {tensor.dtype} on "
+            f"the native backend supports float32 and float64 on the cpu, got {tensor.dtype} on "
             f"{tensor.device}"
         )
     if core is None:
         _tell_once(f"the compiled extension is not loaded: {variant}")
     elif not fits:
         _tell_once(
-            f"kernels take float32 and float64 on the cpu, got {tensor.dtype} on {tensor.device}"
+            f"kernels support float32 and float64 on the cpu, got {tensor.dtype} on {tensor.device}"
         )
     return core is not None and fits
 
@@ -131,7 +131,7 @@ def _tell_once(why: str) -> None:
     # A compiled graph would be broken by the logging
     if why not in _told and not torch.compiler.is_compiling():
         _told.add(why)
-        log.warning("univoxel.ops runs in eager torch, many times slower: %s", why)
+        log.warning("univoxel.ops uses eager PyTorch, which is many times slower: %s", why)
 
 
 def reference_asked() -> bool:
@@ -163,8 +163,8 @@ def require() -> ModuleType:
     """The extension, or an error that says why it is missing."""
     if core is None:
         raise MissingNative(
-            f"univoxel's compiled extension is not loaded: {variant}; `univoxel doctor` says what "
-            "to do"
+            f"univoxel's compiled extension is not loaded: {variant}; run `univoxel doctor` for "
+            "help"
         )
     return core
 
@@ -178,9 +178,9 @@ def require_embree(what: str) -> ModuleType:
     found = require()
     if not found.embree_version():
         raise MissingNative(
-            f"{what}: univoxel was built without Embree, which traces its rays; install a wheel "
-            "that has it (pip install --only-binary univoxel univoxel), or Embree 3 or 4 (Debian: "
-            "apt-get install libembree-dev) and rebuild (pip install .)"
+            f"{what}: univoxel was built without Embree, which it needs for ray tracing; install "
+            "a wheel that includes it (pip install --only-binary univoxel univoxel), or Embree "
+            "3 or 4 (Debian: apt-get install libembree-dev) and rebuild (pip install .)"
         )
     return found
 

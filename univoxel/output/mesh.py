@@ -388,8 +388,8 @@ def placement_of(
     turn, at = torch.from_numpy(moved[:, :3].T.copy()), torch.from_numpy(moved[:, 3].copy())
     if (away := float((middle - at).norm())) > FARTHEST * side:
         raise UserError(
-            f"export: expected a data set whose origin is near, got an object of {side:.4g} at a "
-            f"distance of {away:.6g}: mesh files hold too few digits. Take another origin",
+            f"export: the object of size {side:.4g} is {away:.6g} from the origin, which is too "
+            "far for the digits of mesh files: use another origin",
             "origin",
         )
     return Placement(at, scale, turn)

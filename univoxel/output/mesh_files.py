@@ -307,7 +307,7 @@ def write_obj(path: Path, mesh: TexturedMesh, jpeg: int | None = None) -> None:
     """
     name = path.stem
     if name.split() != [name]:
-        raise UserError(f"{path}: readers of OBJ need a file name without spaces")
+        raise UserError(f"{path}: OBJ files need a name without spaces")
     suffix = "png" if jpeg is None else "jpg"
     metal = "Pm 0" if mesh.metallic is None else f"Pm 1\nmap_Pm {name}_metallic.{suffix}"
     for kind, picture in texture_pictures(mesh).items():

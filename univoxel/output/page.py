@@ -245,9 +245,9 @@ POLICY = (
 LICENCE = "Drawn with three.js, \u00a9 three.js authors, MIT licence, in the page's source."
 SOURCES = {name: f"Map {name!r}: Greg Zaal, Poly Haven, CC0." for name in PHOTOGRAPHED}
 KEYS = """1 to 5: layers
-Left, Right: turn the light; Space: let it turn
-L: dragging turns the light, as it does with Shift
-B: backdrop, S: save the picture, 0: first view"""
+Left, Right: rotate the light; Space: rotate it continuously
+L: dragging rotates the light, as it does with Shift
+B: backdrop, S: save the image, 0: first view"""
 
 
 @dataclass(frozen=True)
@@ -269,7 +269,7 @@ class PageOptions:
     def __post_init__(self) -> None:
         names = [Path(path).stem for path in self.envmaps]
         if len(set(names)) != len(names):
-            raise UserError(f"envmap: expected maps of different names, got {names}", "envmap")
+            raise UserError(f"envmap: expected maps with different names, got {names}", "envmap")
 
 
 SMALL = PageOptions(faces=8_000, texture_size=512)  # for a cell of a notebook
@@ -379,15 +379,15 @@ def facts_of(run: Path, total: float | None = None) -> list[str]:
 
 
 def about(run: Path, options: PageOptions, lights: Sequence[str]) -> str:
-    """The page's panel: notes, measures, what photographs leave open, where all comes from."""
+    """The page's panel: notes, metrics, result and uncertainty, keys, sources."""
     parts = [paragraph(options.notes)] if options.notes else []
     if options.measures:
         rows = [(escape(what), escape(value)) for what, value in options.measures.items()]
-        parts.append(f"<h2>Measures on the test views</h2>{table(rows)}")
+        parts.append(f"<h2>Metrics on the test views</h2>{table(rows)}")
     trust = run / "trust.txt"
     if trust.is_file():
         text = trust.read_text(encoding="utf-8", errors="replace").strip()
-        parts.append(f"<h2>What the photographs leave open</h2>{paragraph(text)}")
+        parts.append(f"<h2>Result and uncertainty</h2>{paragraph(text)}")
     parts.append(f"<h2>Keys</h2><p>{KEYS}</p>")
     sources = [SOURCES[name] for name in lights if name in SOURCES]
     text = " ".join([f"Made by univoxel {__version__}.", LICENCE, *sources])

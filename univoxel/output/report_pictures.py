@@ -203,19 +203,19 @@ def found_light(scene: Scene, mesh: Mesh) -> FoundLight | None:
     """
     sky = scene.environment()
     if sky is not None:
-        about = "The environment map that was recovered."
+        about = "The recovered environment map."
         if scene.flash is not None:
-            about += " Beside it a flash at the camera lit the photographs."
+            about += " In addition, a flash at the camera lit the photographs."
         return FoundLight(scene.exposed(sky.latlong(ROWS)), about)
     if not isinstance(scene.light, AbstractLocalLight):
         return None
     about = (
-        f"This run has no environment map: its light is local ({scene.cfg.light.kind}) and differs "
-        "from point to point. The map shows what points that face a direction get from there, on "
-        "the mean; it holds the shadows of the object on itself too."
+        f"This run has no environment map: its light is local ({scene.cfg.light.kind}) and "
+        "differs from point to point. The map shows the mean light of the points that face each "
+        "direction, which includes shadows of the object on itself."
     )
     if scene.cfg.turntable is not None:
-        about += " It stands in the room of the turntable."
+        about += " It is fixed to the room around the turntable."
     return FoundLight(local_map(scene, mesh), about)
 
 

@@ -89,7 +89,7 @@ def _ffmpeg():
         import imageio_ffmpeg  # pyright: ignore[reportMissingImports]  the extra `video`
     except ImportError:
         raise MissingExtra(
-            "an MP4 needs imageio-ffmpeg: pip install 'univoxel[video]', or choose gif"
+            "an MP4 needs imageio-ffmpeg: pip install 'univoxel[video]', or use gif"
         ) from None
     return imageio_ffmpeg
 

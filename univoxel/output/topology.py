@@ -51,7 +51,7 @@ def cleaned(mesh: Mesh) -> tuple[Mesh, Dropped]:
         faces = _without_degenerate(_welded(vertices, faces))
         faces, dropped = _component_faces(vertices, faces)
     if not len(faces):
-        raise NoSurface("the surface has no part that encloses volume")
+        raise NoSurface("the surface has no part that encloses a volume")
     used, index = np.unique(faces, return_inverse=True)
     seen = None if mesh.seen is None else mesh.seen[torch.from_numpy(used)]
     return _mesh(vertices[used], index.reshape(-1, 3), seen), dropped

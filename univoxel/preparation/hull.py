@@ -200,7 +200,7 @@ def estimate_bounds(
         inside = nodes[sdf < grid.voxel_size]
         if not len(inside):
             raise UserError(
-                "the silhouettes of the photographs share no volume: check masks and cameras"
+                "the silhouettes of the photographs have no common volume: check masks and cameras"
             )
         lower, upper = inside.amin(0), inside.amax(0)
         margin = MARGIN * (upper - lower).norm() + grid.voxel_size

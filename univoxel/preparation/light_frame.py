@@ -138,8 +138,8 @@ def say_strays(photos: Photos) -> None:
     names = ", ".join(photos.names[view] for view in found[:NAMED])
     log.warning(
         "%d of %d photographs were placed off the circle of their turntable, by up to %.1f "
-        "degrees, the others by %.1f in the median: what %s%s show will not fit the rest; "
-        "`univoxel poses` with their masks places all anew; see cameras",
+        "degrees, the others by a median of %.1f. Surfaces that only %s%s show will not fit; to "
+        "find all poses again, run `univoxel poses` with their masks; see cameras",
         len(found),
         len(photos),
         math.degrees(float(circle.off[strays].max())),
@@ -229,8 +229,8 @@ def light_frame_of(
     if frame == "turntable":
         if turntable is None:
             raise DataError(
-                f"{photos.folder}: light_frame turntable: the cameras do not stand around one "
-                "upright axis, so where the turntable's is cannot be told",
+                f"{photos.folder}: light_frame turntable: the cameras are not around one upright "
+                "axis, so the turntable's axis is unknown",
                 "light_frame",
             )
         return LightFrame(turntable)
@@ -241,8 +241,8 @@ def light_frame_of(
     log.debug("flash: %s", flashed)
     if (flashed.shade > SHADE or flashed.glint > GLINT) and flashed.ahead > CERTAIN:
         log.info(
-            "a flash at the camera lit the object: that explains %.0f %% more of how points change "
-            "from photograph to photograph than a light that stands still; see light_frame",
+            "light: a flash at the camera, which explains %.0f %% more of the colour changes "
+            "between photographs than a light that stands still; see light_frame",
             100 * flashed.saved,
             extra={"arguments": ("light_frame",)},
         )
@@ -259,9 +259,9 @@ def light_frame_of(
     if not still_around and found.saved < LEAST:
         return LightFrame()
     log.info(
-        "the light turns with the camera, as on a turntable%s: that explains %.0f %% of how points "
-        "change from photograph to photograph, a light that stands still %.0f %%; see light_frame",
-        f", on which the object lay in {len(turntable.tables)} ways" if turntable.others else "",
+        "light: it turns with the camera, as on a turntable%s; that explains %.0f %% of the "
+        "colour changes between photographs, a light that stands still %.0f %%; see light_frame",
+        f", with {len(turntable.tables)} positions of the object" if turntable.others else "",
         100 * found.by_turning_light,
         100 * max(found.by_still_light, 0.0),  # none, where the other half contradicts it
         extra={"arguments": ("light_frame",)},

@@ -155,11 +155,11 @@ def fitted_masks(photos: Photos, wanted: MasksFrom) -> tuple[Photos, Tensor]:
     excess = mask_excess(colors, covered, away)
     if not excess:
         return photos, distance
-    much = f"masks are {excess} {'pixel' if excess == 1 else 'pixels'} too wide"
+    much = f"masks extend {excess} {'pixel' if excess == 1 else 'pixels'} past the object's edge"
     if wanted == "given":
-        log.info("%s: see masks=auto", much, extra={"arguments": ("masks",)})
+        log.info("%s: masks=auto erodes them", much, extra={"arguments": ("masks",)})
         return photos, distance
-    log.info("%s: they are taken in", much)
+    log.info("%s: they are eroded", much)
     return with_masks(photos, lambda view: eroded(distance[view], excess))
 
 

@@ -212,8 +212,8 @@ def registered_poses(distance: Tensor, cameras: Cameras, box: tuple[Tensor, Tens
     moved = poses.moved(cameras).square().mean().sqrt()
     result = "agree"
     if rest > MAX_CONTRADICTION:
-        result = f"still contradict one another by {rest:.1f} pixels"
-    log.info("cameras moved the object by %.1f pixels on average: silhouettes %s", moved, result)
+        result = f"are still inconsistent by {rest:.1f} pixels"
+    log.info("camera poses refined by %.1f pixels on average: silhouettes %s", moved, result)
     return poses
 
 
@@ -333,16 +333,16 @@ def _widened(
 
 
 def _say(seen: Agreement | None, off: float, believed: bool, refined: bool) -> None:
-    contradicting = f"silhouettes contradict one another by {off:.1f} pixels"
+    contradicting = f"silhouettes are inconsistent by {off:.1f} pixels"
     if math.isinf(off):
-        contradicting = "silhouettes share no volume"
+        contradicting = "silhouettes have no common volume"
     if seen is None and believed:
-        contradicting += ", and no better with other cameras"
+        contradicting += ", and pose refinement does not help"
     if seen is not None:
-        lie = f"matched points lie {seen.median:.2f} pixels from where the cameras put them"
-        contradicting = f"{lie}{': cameras are believed' if believed else ''}; {contradicting}"
+        lie = f"epipolar error {seen.median:.2f} pixels"
+        contradicting = f"{contradicting}, {lie}"
     if believed and not refined:
-        then = "the masks are rough"
+        then = "the masks are taken to be rough; better masks improve the result"
     else:
-        then = "cameras are refined" if refined else "see cameras=refined"
+        then = "camera poses are refined" if refined else "try cameras=refined"
     log.info("%s: %s", contradicting, then, extra={"arguments": ("cameras",)})

@@ -168,8 +168,7 @@ def say_clipped(photos: Photos) -> None:
     share = clipped_share(photos)
     if share > MUCH_CLIPPED:
         log.info(
-            "%.0f %% of the object's pixels are overexposed: they count as at least so bright; "
-            "shorter exposures would tell more",
+            "%.0f %% of the object is overexposed; detail is lost there. Expose darker next time",
             100 * share,
         )
 
@@ -197,22 +196,20 @@ def varying_and_gains(
     stops = float(gains.square().mean().sqrt()) / math.log(2)
     if varying == "none":
         left = contradictions_left(seen) if stops >= MIN_STOPS else 1.0
-        log.debug(
-            "exposures: gains of %.2f stops leave %.2f of what halves contradict", stops, left
-        )
+        log.debug("exposures: gains of %.2f stops leave %.2f of the inconsistency", stops, left)
         if left > MOST_LEFT:
             return varying, None
         varying = "exposure"
         log.info(
-            "exposures differ by %.2f stops from photograph to photograph: a gain is learned for "
-            "each, see varying",
+            "exposures differ by %.2f stops between photographs: a gain is learned for each; "
+            "see varying",
             stops,
             extra={"arguments": ("varying",)},
         )
     return varying, gains
 
 
-PINNED = "hull that stays"  # a step
+PINNED = "frozen hull"  # a step
 
 
 def unhurried(step: str, needed: bool = False) -> bool:
@@ -266,7 +263,7 @@ def find_silhouettes(
     in_time = begins("masks")
     photos, distance = fitted_masks(given, cfg.masks if in_time else "given")
     try:
-        if begins("masks against cameras"):
+        if begins("consistency of masks and cameras"):
             belief = choose_masks_or_poses(photos, distance, cfg.cameras, cfg.masks)
         else:
             belief = masks_or_poses_as_told(photos, distance, cfg.cameras)

@@ -266,7 +266,7 @@ def build_problem(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> 
     position, normal = surface_points(mesh, cfg.points, generator)
     observations = observe(position, normal, photos, tracer, offset)
     if not len(observations.view):
-        raise NoSurface("no photograph sees a point of the surface")
+        raise NoSurface("no surface point is seen in any photograph")
     direction = scene.sky.direction
     transport = trace(
         observations, tracer, mesh, vertex_color, direction, cfg.tracing, offset, generator

@@ -325,7 +325,7 @@ class Clock:
         if not (short := self.short()):
             return ""
         stages = ", ".join(f"{made:.0%} for {name}" for name, made in short.items())
-        why = "this training was stopped" if self.finished else "time ended this training"
+        why = "the training was stopped" if self.finished else "the time limit ended the training"
         return f"{why} early: of the planned steps it made {stages}"
 
     def minutes_for_all(self) -> float:

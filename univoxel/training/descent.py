@@ -136,9 +136,7 @@ class Guard:
             self._best, self._kind = -math.inf, kind
         if not psnr > self._best - FAR:  # NaN too
             best = f", {self._best:.1f} dB at best" if math.isfinite(self._best) else ""
-            self._fail(
-                f"held-out quality is {psnr:.1f} dB{best}", True, "there is no state to go back to"
-            )
+            self._fail(f"validation PSNR is {psnr:.1f} dB{best}", True, "there is no earlier state")
             return
         self._best = min(max(self._best, psnr), ENOUGH)
         if psnr > self._best - FAR / 2:
@@ -166,13 +164,13 @@ class Guard:
         where = f"stage {self._progress.clock.stage + 1}, step {self._progress.clock.step}: {what}"
         if self._failures > LIMIT:
             self._progress.trouble(
-                f"{where}; {LIMIT} smaller steps did not help: the stage ends with the last state "
-                "that was good"
+                f"{where}; {LIMIT} smaller step sizes did not help: the stage ends with the last "
+                "good state"
             )
             self._progress.clock.abandon()
             return
-        done = "went back to the last good state" if back else otherwise
-        self._progress.trouble(f"{where}; {done}, steps are {self.scale:g} times as long from here")
+        done = "returned to the last good state" if back else otherwise
+        self._progress.trouble(f"{where}; {done}, step size now times {self.scale:g}")
 
 
 # When held-out rays do not improve any more.

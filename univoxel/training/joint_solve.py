@@ -248,8 +248,8 @@ def start_(
         progress.trouble(trouble)
     if decisions.only_metal and cfg.only_metal is None:
         progress.say(
-            "the whole object is taken for metal: that explains the photographs about as well as "
-            "anything else; see --metal"
+            "the whole object is classified as metal, because that explains the photographs "
+            "about as well as anything else; if it is not, use --metal some"
         )
     if not cfg.colors:
         return decisions

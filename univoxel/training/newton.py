@@ -53,7 +53,7 @@ MIN_PARTS = 2
 
 
 NEWTON_CHUNK = 256  # points whose equations are built at once
-UNSOLVABLE = "the equations for the map have no solution: it stays as it is in this round"
+UNSOLVABLE = "the equations for the environment map have no solution: it stays for this round"
 
 
 @dataclass(frozen=True)

@@ -173,7 +173,7 @@ class Progress:
         self._show(f"preparation: {what}", "")
         if not needed and self.clock.hurried and not self._goes_on:
             self.skipped.append(what)
-            log.info(f"minutes leave no time to look at {what}", extra={"arguments": ("minutes",)})
+            log.info(f"minutes leave no time for {what}", extra={"arguments": ("minutes",)})
         return what not in self.skipped
 
     def prepared(self) -> None:
@@ -183,7 +183,7 @@ class Progress:
 
     def _show(self, what: str, facts: str) -> None:
         """Move the bar."""
-        times = f"{_clock(self.clock.seconds)} gone, {_clock(self.clock.remaining)} left "
+        times = f"{_clock(self.clock.seconds)} elapsed, {_clock(self.clock.remaining)} left "
         self._bar.update(
             self._task, completed=self.clock.share_done, description=what, facts=facts + times
         )
@@ -240,11 +240,8 @@ class Progress:
                 self._on_progress(TrainingProgress(*place, losses, psnr, rate))
         quality = "" if psnr is None else f"validation {psnr:.1f} dB  "
         if self.troubles:
-            quality += f"{len(self.troubles)} troubles  "
-        self._show(
-            f"{name} ({clock.stage + 1} of {len(self.cfg.stages)})",
-            f"loss {sum(losses.values()):.4f}  {quality}{rate / 1e3:.0f}k rays/s  ",
-        )
+            quality += f"recovered {len(self.troubles)} times  "
+        self._show(f"{name} ({clock.stage + 1} of {len(self.cfg.stages)})", quality)
 
 
 def _clock(seconds: float) -> str:
