@@ -28,7 +28,7 @@ class Published:
 
     name: str
     where: str  # data and machine
-    minutes: float | None  # of training; None where none is published
+    minutes: float | None  # of training; None if none is published
     measures: dict[str, float]
 
 
@@ -138,8 +138,8 @@ def fronts(outcomes: Sequence[Outcome]) -> dict[str, dict[str, list[str]]]:
 
 
 def plot(outcomes: Sequence[Outcome], stem: Path) -> list[Path]:
-    """For each scene a panel for each measure that there is, and one of the held-out rays while
-    training went on."""
+    """For each scene a panel for each measure that there is, and one of the validation pixels while
+    training continued."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogFormatter
 
@@ -177,7 +177,7 @@ def plot(outcomes: Sequence[Outcome], stem: Path) -> list[Path]:
 
 
 def _marks(outcomes: Sequence[Outcome]) -> dict[str, str]:
-    """What stands beside a setting's dots: a preset's name, a number for others."""
+    """What is beside a setting's dots: a preset's name, a number for others."""
     names = list(dict.fromkeys(o.setting for o in outcomes))
     others = [name for name in names if name not in PRESETS]
     return {name: name if name in PRESETS else str(others.index(name) + 1) for name in names}

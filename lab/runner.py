@@ -57,7 +57,7 @@ def run_pairs(
 
     out/SCENE/SETTING/ holds the run, what it said (job.txt) and result.json, an `Outcome`. A
     training whose result.json is there already is not done again; one that failed is. A failure is
-    an outcome like others, that of a scene that cannot be read too: the rest goes on.
+    an outcome like others, that of a scene that cannot be read too: the rest continues.
 
     Args:
         pairs: scenes are told apart by the names of their folders.

@@ -56,7 +56,7 @@ TO_MAP = torch.tensor([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 def submit(
     run: str | Path, out: str | Path, samples: int = SAMPLES, bounces: int = BOUNCES
 ) -> Path:
-    """Write what Stanford-ORB measures of a run that was trained on a scene of it; return its list.
+    """Write what Stanford-ORB metrics of a run that was trained on a scene of it; return its list.
 
     Views of other scenes are rendered in the light that was measured there, where the data has it.
 

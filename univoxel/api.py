@@ -60,7 +60,7 @@ class Run:
         return f"Run({str(self.path)!r})"
 
     def _repr_html_(self) -> str | None:
-        """The page of `univoxel view` in a frame, for notebooks; None where there is no surface."""
+        """The page of `univoxel view` in a frame, for notebooks; None if there is no surface."""
         try:
             options = page_options(self.path) | {"texture_size": SMALL.texture_size}
             text = page_text(self.path, self.scene, replace(SMALL, **options))
@@ -102,7 +102,7 @@ class Run:
         """Pictures under new light: [F, H, W, 4] linear RGBA, premultiplied.
 
         Args:
-            envmap: a file, a map, or None for suns and point lights alone.
+            envmap: a file, a map, or None for suns and point lights only.
             cameras, options: fields of `univoxel.cli.relight.RelightOptions`.
 
         Raises:
@@ -153,7 +153,7 @@ class Run:
         """The environment map that was recovered, `height` rows of it.
 
         Raises:
-            UserError: this run has none: it was trained with local light alone.
+            UserError: this run has none: it was trained with local light only.
         """
         return EnvMap(recovered_map(self.scene, self.path, height))
 
@@ -180,7 +180,7 @@ class Run:
 
     @property
     def log(self) -> list[dict[str, Any]]:
-        """What training reported, every few seconds: time, losses, held-out quality."""
+        """What training reported, every few seconds: time, losses, validation PSNR."""
         file = self.path / LOG
         if not file.is_file():
             return []
@@ -245,10 +245,10 @@ def train(
         data: folder of the photographs and their cameras; or the whole configuration, which says
             all but resume, timelapse, on_progress and view: then the folder of the run is returned.
         out: folder that the run is written to.
-        resume: go on with the run in out from its last checkpoint.
+        resume: continue with the run in out from its last checkpoint.
         timelapse: .gif, .mp4 or folder for pictures of a view over training time.
         on_progress: called every few seconds of training. Raise `univoxel.Cancelled` in it to end
-            the training: it is saved, and goes on with resume.
+            the training: it is saved, and continues with resume.
         view: host and port that browsers may look at the training at, such as ("127.0.0.1", 8080);
             port 0: any free one. A button there ends it early, with a result.
         options: fields of `univoxel.cli.train.TrainOptions`, such as preset, light, varying,

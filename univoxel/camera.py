@@ -61,7 +61,7 @@ def stacked(pictures: Sequence[Tensor], beyond: float = 0) -> Tensor:
     """Pictures [h, w, ...] of any sizes as `Cameras` has them stored: [V, H, W, ...].
 
     Args:
-        beyond: what stands where there is no picture.
+        beyond: what is if there is no picture.
     """
     first = pictures[0]
     if all(picture.shape == first.shape for picture in pictures):
@@ -167,7 +167,7 @@ ON = 0.005
 # in five thousand times
 STRAY = 3.5
 LEAST = 0.007  # of the radius: below it nobody minds, 0.4 degrees
-MOST = 0.1  # of the radius: what stands further away was put there
+MOST = 0.1  # of the radius: what is further away was put there
 MAJORITY = 0.75  # share of the cameras, on the circle at least
 AROUND = 0.3  # narrower over wider spread in the circle's plane, at least: a short arc has any axis
 

@@ -40,7 +40,7 @@ class EnvMap:
             )
         if r.dtype != torch.float32:
             raise ValueError(f"environment map: expected float32 radiance, got {r.dtype}")
-        low, high = r.aminmax()  # NaN where there is one
+        low, high = r.aminmax()  # NaN if there is one
         if not (low >= 0 and high < math.inf):
             bad = (~r.isfinite() | (r < 0)).nonzero()
             row, column, channel = bad[0].tolist()

@@ -25,7 +25,7 @@ class Work:
     # Rates at the beginning of a stage: few steps want larger ones
     lr_networks: float
     lr_sdf: float
-    # Of the joint solve under the hybrid light: normals want steps more than observations
+    # Of the joint optimisation under the hybrid light: normals want steps more than observations
     joint_steps: float
     observations: float  # per step
     directions: float  # of the light at a point, per step; the hybrid light's turn at random

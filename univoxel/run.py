@@ -135,11 +135,11 @@ class Evidence:
     stopped: bool = False  # by hand
     minutes: float | None = None  # in which all steps would have been made
     limit: float | None = None  # minutes; None: there was none
-    psnr: float | None = None  # dB, of held-out pixels
-    outline: float | None = None  # share of held-out pixels on the wrong side of the silhouette
+    psnr: float | None = None  # dB, of validation pixels
+    outline: float | None = None  # share of validation pixels on the wrong side of the silhouette
     hidden: float | None = None  # share of the surface that too few cameras see
     residual: float | None = None  # share of the surface that differs from its photographs
-    troubles: int = 0  # steps or stages that went wrong and were mended
+    troubles: int = 0  # steps or stages that went wrong and were repaired
 
 
 @dataclass(frozen=True)
@@ -251,7 +251,7 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
 
 
 def load_verdict(run: Path) -> Verdict | None:
-    """The verdict on a run; None where there is none: it has not ended, or an older version trained
+    """The verdict on a run; None if there is none: it has not ended, or an older version trained
     it."""
     try:
         values = read_json(run / FILE)

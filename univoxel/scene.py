@@ -200,7 +200,7 @@ class Scene(nn.Module):
     @contextmanager
     def surface_held(self) -> Iterator[None]:
         """A block in which `occluder` stays as it was first asked for, though the surface moves,
-        until `release_surface`: tracing anew in every step would cost more than the step."""
+        until `release_surface`: tracing again in every step would cost more than the step."""
         stale = self._traced is not None and not self._traced[1].holds(self.field.sdf)
         if stale and not self._held:
             self._traced = None
@@ -352,7 +352,7 @@ class State:
     took: tuple[float, ...] = ()
     stage_took: float = 0.0
     finished: bool = False
-    within: Within | None = None  # None: at the begin of a stage, or in one without rounds
+    within: Within | None = None  # None: at the start of a stage, or in one without rounds
     seconds: float = 0.0
     chosen: tuple[Choice, ...] = ()
     troubles: tuple[str, ...] = ()
@@ -402,7 +402,7 @@ def load_checkpoint(run: str | Path) -> tuple[Scene, dict[str, Any]]:
         if "field.place" in tensors:
             where = tensors.pop("field.place"), tensors.pop("field.inside")
             bricks = unpack_bricks(*where, about.grid.size)
-        with torch.device("meta"):  # sizes alone
+        with torch.device("meta"):  # sizes only
             _compare(_scene(about, bricks), tensors)
         scene = _scene(about, bricks)
         _unpack_(scene, tensors)

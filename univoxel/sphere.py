@@ -12,7 +12,7 @@ from torch import Tensor
 
 _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 # Of an azimuth from the front, counter-clockwise seen from above: eighths of a turn. Left and right
-# are those of whoever stands in front.
+# are those of whoever is in front.
 SIDES = (
     *("front", "front right", "right", "back right"),
     *("back", "back left", "left", "front left"),

@@ -130,7 +130,7 @@ def pieces(metal: np.ndarray, true: np.ndarray, part: np.ndarray) -> tuple[int, 
 
 
 def share(which: np.ndarray, among: np.ndarray) -> float | None:
-    """Of some pixels; None where there are too few."""
+    """Of some pixels; None if there are too few."""
     return float(which[among].mean()) if among.mean() > LEAST else None
 
 

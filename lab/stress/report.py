@@ -46,7 +46,7 @@ class Cell:
         return [v for v in found if v is not None and math.isfinite(v)]
 
     def mean(self, key: str) -> float | None:
-        """None where a seed failed or gave no finite number: half an answer would flatter."""
+        """None if a seed failed or gave no finite number: half an answer would flatter."""
         found = self.values(key)
         return fmean(found) if found and len(found) == len(self.outcomes) else None
 

@@ -173,7 +173,7 @@ def surface_points(parts: Sequence[Part], count: int = POINTS) -> np.ndarray:
     u, v = torch.where(flip, 1 - u, u), torch.where(flip, 1 - v, v)
     a, b, c = corners[face].unbind(1)
     points = a + u[:, None] * (b - a) + v[:, None] * (c - a)
-    # Parts stand in one another: what no ray leaves is inside
+    # Parts are in one another: what no ray leaves is inside
     scene = VisibilityScene(mesh["vertices"], mesh["faces"])
     start = points + 1e-3 * torch.nn.functional.normalize(normal[face], dim=1)
     seen = torch.zeros(len(points), dtype=torch.bool)

@@ -177,7 +177,7 @@ def test_mistakes_are_found_before_anything_is_trained(data, tmp_path, trained):
 
 def test_scenes_with_settings_of_their_own(data, tmp_path, trained):
     other = tmp_path / "other"
-    other.mkdir()  # cannot be read: its process says so, the rest goes on
+    other.mkdir()  # cannot be read: its process says so, the rest continues
     twice = dataclasses.replace(SMALL, name="twice")
     pairs = [(data, SMALL), (other, twice), (data, twice)]
     found = runner.run_pairs(pairs, tmp_path / "out", samples=1)

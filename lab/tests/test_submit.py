@@ -66,7 +66,7 @@ def test_a_submission(orb, tmp_path, capsys):
         assert picture(view["output_image"]).shape == (SIZE, SIZE, 3)
         assert picture(material["output_image"]).shape == (SIZE, SIZE, 3)
         normal = picture(geometry["output_normal"])
-        # The middle of a ball faces its camera. Its silhouette alone has been trained on so far
+        # The middle of a ball faces its camera. Its silhouette only has been trained on so far
         x, y, z = normal[SIZE // 2 - 32 : SIZE // 2 + 32, SIZE // 2 - 32 : SIZE // 2 + 32].mean(
             (0, 1)
         )

@@ -289,10 +289,7 @@ def broken_relit(folders):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            lambda f: (f.run / "config.json").unlink(),
-            r"folder of a run, but it has no",
-        ),
+        (lambda f: (f.run / "config.json").unlink(), r"folder of a run, but it has no"),
         (lambda f: (f.run / "config.json").write_text("{}"), "config.json: expected data, a"),
         (lambda f: (f.run / "config.json").write_text("{"), "config.json: .* JSON"),
         (

@@ -24,10 +24,7 @@ def test_the_fields_that_a_joint_stage_has_always_had(config):
 
 @pytest.mark.parametrize(
     ("record", "name", "text", "value"),
-    [
-        ("metal", "min_reflectance", "0.3", 0.3),
-        ("entropy", "teaching_steps", "5", 5),
-    ],
+    [("metal", "min_reflectance", "0.3", 0.3), ("entropy", "teaching_steps", "5", 5)],
 )
 def test_fields_of_a_record_in_a_stage(config, record, name, text, value):
     joint = changed(config, [f"stages.2.{record}.{name}={text}"]).stages[2]

@@ -95,10 +95,7 @@ SENSOR = '<sensor id="3" label="unknown" type="frame">'
         (edited(("<f>11.0", "<f>wide")), "sensor 3 of p_000: expected a number as f, got 'wide'"),
         (edited(("<f>11.0", "<f>-11.0")), "sensor 3 of p_000: expected fl_x between 0 and inf"),
         (edited(("<f>11.0", "<p3>.1</p3><f>11.0")), "expected distortion by k1 to k4, p1 and p2"),
-        (
-            edited(("<f>11.0", "<b2>2</b2><f>11.0")),
-            "p_000: expected pixels with perp",
-        ),
+        (edited(("<f>11.0", "<b2>2</b2><f>11.0")), "p_000: expected pixels with perp"),
         (edited(('width="12"', 'width="0"')), "sensor 3 of p_000: expected a resolution above 0,"),
         (edited(('width="12"', "")), "sensor 3 of p_000: expected a number as width, got nothing"),
         (edited(('width="12"', 'width="9"')), r"p_000.png: expected a picture of the shape 9x8"),

@@ -6,13 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from analytic import cameras_around, hull_of, sphere_scene
-from observed_points import (
-    lamps,
-    no_metal,
-    photographs_under,
-    problem_on_a_sphere,
-    random_problem,
-)
+from observed_points import lamps, no_metal, photographs_under, problem_on_a_sphere, random_problem
 from torch.nn.functional import normalize
 
 from univoxel import brdf

@@ -295,10 +295,7 @@ def test_a_training_that_was_cancelled_is_shown_too(data, tmp_path, monkeypatch)
     cfg = preset("draft", data, tmp_path / "run", "sg")
     small = [replace(s, voxels=0.01, rays=64, iterations=5) for s in cfg.stages]
     with pytest.raises(univoxel.Cancelled):
-        train(
-            replace(cfg, stages=tuple(small), voxel_pixels=0.0, **GIVEN),
-            on_progress=cancel,
-        )
+        train(replace(cfg, stages=tuple(small), voxel_pixels=0.0, **GIVEN), on_progress=cancel)
     text = univoxel.open_run(tmp_path / "run").report(size=SIZE, views=0).read_text()
     said = section(text, "Training")
     assert "Training has not ended: it is in stage 2." in said

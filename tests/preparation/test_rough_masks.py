@@ -12,11 +12,7 @@ from univoxel.data import Photos
 from univoxel.errors import DataError
 from univoxel.preparation import pose_refinement, prepare
 from univoxel.preparation.hull import hull_sdf, mask_distances
-from univoxel.preparation.pose_refinement import (
-    MAX_CONTRADICTION,
-    Belief,
-    choose_masks_or_poses,
-)
+from univoxel.preparation.pose_refinement import MAX_CONTRADICTION, Belief, choose_masks_or_poses
 from univoxel.preparation.rough_masks import doubt_masks, thick
 from univoxel.presets import preset
 

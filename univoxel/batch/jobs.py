@@ -92,7 +92,7 @@ class Job:
         write_json(self.file(".json"), record)
 
     def check_same(self) -> None:
-        """Refuse, by an ExistingFile, to go on with what other options began."""
+        """Refuse, by an ExistingFile, to continue with what other options began."""
         before = self.record()["identity"]
         other = [key for key, value in self.identity.items() if before and before.get(key) != value]
         if other:
@@ -181,7 +181,7 @@ def last_line(log: Path | None) -> dict[str, Any]:
     return {}
 
 
-# Jobs on workers of Dask: those of this machine alone, or of a cluster that is there.
+# Jobs on workers of Dask: those of this machine only, or of a cluster that is there.
 
 
 TICK_SECONDS = 0.25

@@ -139,7 +139,7 @@ PHOTOGRAPHS = 12
 # Voxels along a side of the grid whose silhouettes are masks themselves, and pixels that they are
 # wide at most
 FINE, WIDTH = 128, 500
-# Share of the object's surface that depth shows, below which depth alone has guessed its shape
+# Share of the object's surface that depth shows, below which depth only has guessed its shape
 GUESSED = 0.15
 # Share of the object's surface that depth has to show for it to be believed against most masks
 SURE = 0.5
@@ -163,11 +163,11 @@ def cutout(
 
     All splits are written, in the layout of NeRF-synthetic scenes, without lens distortion, beside
     masks.png and masks.html, which show the masks, worst first. The object is found from the
-    training photographs alone.
+    training photographs only.
 
     Args:
         out: folder to write.
-        source: where masks come from: rembg, from a network; none, from depth alone, of what
+        source: where masks come from: rembg, from a network; none, from depth only, of what
             stands out from its support in the middle; else a folder of masks.
         downscale: side of the squares of pixels that become one, 0 as of `load_photos`.
         allow_outside: as of `load_photos`.
@@ -180,7 +180,7 @@ def cutout(
         DataError: photographs or masks that cannot be used, or nothing stands out in depth.
         ExistingFile: out is there already.
         MissingExtra: there is no network.
-        UserError: the masks have nothing in common, or arguments contradict one another.
+        UserError: the masks have nothing in common, or arguments are inconsistent.
         OSError: a file cannot be written.
     """
     data, out, origin = Path(data), Path(out), str(source)
@@ -212,7 +212,7 @@ def cutout(
 
 
 def check_masks(origin: str, network: str, box: Sequence[float] | None, keep_table: bool) -> None:
-    """Refuse, by a UserError, choices of masks that contradict one another.
+    """Refuse, by a UserError, choices of masks that are inconsistent.
 
     Args:
         origin: where masks come from.

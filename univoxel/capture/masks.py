@@ -55,7 +55,7 @@ NETWORKS: dict[str, Network] = {
 
 
 def check_network(name: str) -> Network:
-    """The network of a name; a UserError where there is none."""
+    """The network of a name; a UserError if there is none."""
     if name not in NETWORKS:
         raise UserError(f"network: expected one of {', '.join(NETWORKS)}, got {name}", "network")
     return NETWORKS[name]
@@ -209,7 +209,7 @@ def repaired(mask: Tensor, silhouette: Tensor, voxel: float) -> Tensor:
     """The mask within the grown silhouette, and all of the shrunk one; borders one voxel soft.
 
     In the band between both the mask is believed where it ends there, full on the inner side and
-    empty on the outer one. Elsewhere, as where the table goes on, the silhouette is.
+    empty on the outer one. Elsewhere, as where the table continues, the silhouette is.
     """
     small = shrunk(mask, silhouette.shape[1], silhouette.shape[0])
     away = mask_distances(silhouette.float()[None])[0] / voxel

@@ -66,7 +66,7 @@ class Photograph:
     camera: str = ""  # maker and model
     focal: tuple[float, float] = (0.0, 0.0)  # millimetres: as it is, and for 35 mm film; 0 unknown
     whole: bool = False  # whether the file is as the camera took it, not cropped or shrunk
-    turned: int = 1  # how the stored pixels must be turned, as of EXIF
+    turned: int = 1  # how the stored pixels must be turned, as in EXIF
 
     @property
     def name(self) -> str:
@@ -137,7 +137,7 @@ def require_readers(paths: list[Path]) -> None:
 
 
 def describe(path: Path) -> Photograph:
-    """Size and camera of a photograph, from its beginning alone; a DataError if it is damaged."""
+    """Size and camera of a photograph, from its beginning only; a DataError if it is damaged."""
     try:
         if path.suffix.lower() in RAW:
             return _describe_raw(path)
@@ -276,7 +276,7 @@ PRIMARIES = {
     "smpte240m": (0.630, 0.340, 0.310, 0.595, 0.155, 0.070, 0.3127, 0.3290),
     "bt470bg": (0.640, 0.330, 0.290, 0.600, 0.150, 0.060, 0.3127, 0.3290),
 }
-# Of a video that states primaries alone
+# Of a video that states primaries only
 MATRIX_OF = {"bt709": "bt709", "bt2020": "bt2020", "smpte432": "bt709"}
 MATRIX_OF |= dict.fromkeys(("smpte170m", "bt470bg"), "bt601")
 OTHER_MATRICES = ("bt2020c", "ictcp", "ipt-c2", "ycgco", "smpte2085")  # that ffmpeg does not undo
@@ -453,7 +453,7 @@ def _ffmpeg(video: Path, filters: str, *output: str, place: str | None = None) -
 
 
 def _opened(video: Path) -> list[str]:
-    """Arguments that open a video alone: no file that it names, nothing over a network."""
+    """Arguments that open a video only: no file that it names, nothing over a network."""
     allowed = ["-protocol_whitelist", "file", "-format_whitelist", VIDEO_FORMATS]
     return [*allowed, "-i", f"file:{video.absolute()}"]
 

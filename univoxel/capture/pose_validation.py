@@ -61,7 +61,7 @@ def partners(
         a, b = looks[pair.first], looks[pair.second]
         for one, other, columns in ((a, b, [0, 1]), (b, a, [1, 0])):
             matches = pair.matches[:, columns]
-            # A shift alone is what stands still in the pictures, whatever the cameras do
+            # A shift only is what stands still in the pictures, whatever the cameras do
             off = _off(model, one, other, matches)
             fitting = 0 if pair.kind == WATERMARK else int((off < FITTING_PIXELS).sum())
             found[one.image.number].append(Partner(other.image.number, len(matches), fitting))
@@ -141,7 +141,7 @@ def doubt(model: Model, image: Placed, error: float) -> float:
 
 
 def still(pairs: Sequence[tuple[int, int, int, int]]) -> tuple[int, int]:
-    """Pairs whose match is a shift alone, and pairs that match at all.
+    """Pairs whose match is a shift only, and pairs that match at all.
 
     Args:
         pairs: as `model.verified_pairs` has them.

@@ -30,10 +30,10 @@ from univoxel.errors import DataError, ExistingFile, StillBackground
 from univoxel.sphere import gaps
 
 WORK = "sfm"  # folder in the scene that the steps keep their results in
-# Steps that are noted in it: those of the search, with its settings, and what stands by itself
+# Steps that are noted in it: those of the search, with its settings, and what is by itself
 SEARCH, FRAMES, SCENE = "search", "frames", "scene"
 PARTS = FEATURES, PAIRS, MATCHES, MODELS = "features", "choosing pairs", "matching", "placing"
-# Share of pairs whose match is a shift alone, from where on the background stands still while the
+# Share of pairs whose match is a shift only, from where on the background stands still while the
 # object turns: on a turntable it was .6, elsewhere 0, with poor masks .04
 STILL_SHARE = 0.2
 PLACED_SHARE = 0.8  # of the photographs, below which the capture is no use
@@ -70,12 +70,12 @@ def poses(
     """Write photographs upright, with the cameras they were taken with, as a scene; return out.
 
     The world has +Z up, its origin where the cameras look, and the median distance of cameras from
-    it is 4. An interrupted search goes on with the same call.
+    it is 4. An interrupted search continues with the same call.
 
     Args:
         photographs: a folder of photographs of any common format, or a video.
         out: folder to write: images/, masks/, sparse/0 and poses.json, and sfm/ for the steps.
-        masks: folder of a mask for each photograph; features are sought within them alone.
+        masks: folder of a mask for each photograph; features are sought within them only.
         every: seconds of a video, of each of which the sharpest frame is taken.
         keep_size: pixels of written photographs along the longer side, at most; 0 for any.
         keep_weak: write photographs too whose cameras are not trusted.
@@ -195,7 +195,7 @@ def photographs_of(
 def _settings(
     source: Path, masks: Path | None, every: float | None, config: CaptureConfig, capture: Capture
 ) -> dict:
-    """What decides the cameras: the same settings go on with the same work."""
+    """What decides the cameras: the same settings continue with the same work."""
     files = [p.path for p in capture.photographs] + list(capture.masks or [])
     return {
         "engine": "pycolmap",
@@ -208,7 +208,7 @@ def _settings(
 
 
 def _begin(out: Path, folders: Folders, settings: dict, written: dict) -> bool:
-    """Begin a search, or go on with it; whether all is done already."""
+    """Begin a search, or continue with it; whether all is done already."""
     if (out / scene.REPORT).exists():
         other = ExistingFile(f"{out} holds another scene: choose another out", "out")
         if not steps.done(folders.work, SEARCH, settings, lambda _: other):

@@ -29,7 +29,7 @@ class Given:
 
     path: Path
     kind: Kind  # a folder or a video; photographs with cameras; a trained run
-    files: list[tuple[str, int]]  # names and bytes of photographs; else the folder alone
+    files: list[tuple[str, int]]  # names and bytes of photographs; else the folder only
 
     @property
     def words(self) -> str:
@@ -68,7 +68,7 @@ def look_at(path: Path) -> Given:
 
 
 def begin(project: Project, given: Given) -> None:
-    """Make the folder of a capture, or go on with it.
+    """Make the folder of a capture, or continue with it.
 
     Raises:
         ExistingFile: it holds the capture of something else, or other files.

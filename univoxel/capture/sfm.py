@@ -41,7 +41,7 @@ class Request:
     masks: str = ""  # folder of NAME.png, or empty
     names: tuple[str, ...] = ()  # pictures of one camera, for extraction
     parameters: str = ""  # camera parameters to begin with, or empty
-    existing_camera: int | None = None  # of the database, where extraction goes on
+    existing_camera: int | None = None  # of the database, where extraction continues
     features: int = 4096
     first_octave: int = -1
     seed: int = 0

@@ -48,7 +48,7 @@ MISTAKES = (UserError, OSError, MemoryError)
 # Of files and disks of the user, whether or not the error names the file
 DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
 PACKAGE = Path(__file__).resolve().parents[1]
-CLONE = PACKAGE.parent  # of the repository, where the package stands in one
+CLONE = PACKAGE.parent  # of the repository, where the package is in one
 # Options whose names differ from the arguments of the package's functions
 OPTIONS = {"changes": "--set", "source": "--from"}
 
@@ -96,12 +96,12 @@ LABORATORY = ("compare", "chart", "stress", "bank", "submit")
 
 
 def has_laboratory() -> bool:
-    """Whether the package stands in a clone, beside the folder `lab`, which no wheel holds."""
+    """Whether the package is in a clone, beside the folder `lab`, which no wheel holds."""
     return (CLONE / "lab" / "commands.py").is_file()
 
 
 def laboratory() -> dict[str, Command]:
-    """Commands of the laboratory by name; a MissingExtra where there is none beside the package."""
+    """Commands of the experiments by name; a MissingExtra if there is none beside the package."""
     if not has_laboratory():
         raise MissingExtra(
             f"{', '.join(LABORATORY)} are experiments, which the installed package lacks: clone "
@@ -187,7 +187,7 @@ def understood(arguments: Sequence[str]) -> Call | None:
 
     Raises:
         Usage: they make no command.
-        MissingExtra: one of the laboratory, which is not there.
+        MissingExtra: one of the experiments, which is not there.
     """
     match arguments:
         case [name, *_] if name in LABORATORY:
@@ -231,7 +231,7 @@ def take_threads(threads: int | None) -> None:
     """Let kernels, torch and processes begun from here run on so many threads.
 
     None: as many as OMP_NUM_THREADS says, or else as there are cores. Where a control group grants
-    less of those, as of a container, OpenMP does not see it: a thread for each would wait.
+    less of those, as in a container, OpenMP does not see it: a thread for each would wait.
     """
     if threads is None:
         granted = machine.cores()

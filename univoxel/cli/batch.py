@@ -59,7 +59,7 @@ class BatchOptions:
     """also write the contents of batch.json here; - prints them, not the table"""
 
     def training(self) -> TrainConfig:
-        """The configuration of a training; a UserError where there is none of that kind."""
+        """The configuration of a training; a UserError if there is none of that kind."""
         from univoxel.config import load_config
         from univoxel.core.validation import changed
         from univoxel.presets import chosen
@@ -76,7 +76,7 @@ class BatchOptions:
         return changed(replace(config, minutes=minutes), self.changes)
 
     def identity(self, data: Path) -> dict[str, Any]:
-        """What a later sitting must agree with to go on; JSON. Steps may be added."""
+        """What a later sitting must agree with to continue; JSON. Steps may be added."""
         said = {name: getattr(self, name) for name in EACH[1:]} | {"data": str(data)}
         if self.config is not None:
             said["config"] = read_json(self.config)
@@ -114,7 +114,7 @@ def command(asked: BatchOptions) -> None:
 def batch(asked: BatchOptions, threads: int | None = None) -> list[SceneResult]:
     """Take scenes through steps, each in processes of its own; return what came out, in order.
 
-    index.html, batch.json and batch.csv tell of all of them, and are written anew as each ends.
+    index.html, batch.json and batch.csv tell of all of them, and are written again as each ends.
 
     Args:
         threads: of each scene; None: as the machine allows.

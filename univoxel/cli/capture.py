@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from univoxel.training.progress import TrainingProgress
 
 
-AUTO = "auto"  # masks that the photographs have, or else of a network, or of depth alone
+AUTO = "auto"  # masks that the photographs have, or else of a network, or of depth only
 STEPS = ("cameras", "masks", "training", "mesh", "pictures", "page")
 
 
@@ -134,11 +134,11 @@ def capture(
     pictures: PicturesConfig = PICTURES,
     **options: Any,
 ) -> Captured:
-    """Make an object that can be lit anew from photographs, in steps that are each kept.
+    """Make an object that can be lit again from photographs, in steps that are each kept.
 
     Below `out`: scene/ holds photographs and cameras, cut/ those with masks, run/ the training,
     pictures/ the object under other light and measures, then the mesh and index.html. What is
-    there is not made again, so the same call goes on after an interruption. What is of one's own
+    there is not made again, so the same call continues after an interruption. What is of one's own
     takes the place of a step: photographs with cameras, masks, a run.
 
     Args:
@@ -149,7 +149,7 @@ def capture(
         config: how cameras are found.
         pictures: how many are made, and how large.
         options: fields of `univoxel.cli.capture.CaptureOptions`, such as masks, box, preset and
-            minutes; until stays page, `find_data` makes the first steps alone.
+            minutes; until stays page, `find_data` makes the first steps only.
 
     Raises:
         ExistingFile: out holds another capture, or what other options made.
@@ -270,7 +270,7 @@ def _check_machine(given: Given, asked: CaptureOptions) -> None:
 
 
 def _check_network(project: Project, asked: CaptureOptions) -> None:
-    """Refuse to go on with masks of single photographs that another network made."""
+    """Refuse to continue with masks of single photographs that another network made."""
     from univoxel.capture.project import SINGLE
 
     def other(before: str) -> ExistingFile:
@@ -515,7 +515,7 @@ def _picture(project: Project, run: Path, config: PicturesConfig) -> None:
 
 
 def _write_page(project: Project, given: Given, run: Path) -> None:
-    """Write the page of the object, which also says what lies beside it."""
+    """Write the page of the object, which also says what is beside it."""
     from univoxel.detail.texture import page_options
     from univoxel.evaluation.measures import in_words
     from univoxel.output.page import write_page

@@ -195,7 +195,7 @@ def torch_build() -> str:
 
 
 def extras(distribution: str = "univoxel") -> dict[str, list[str]] | None:
-    """Packages that are missing of each extra for users; None where nothing is installed."""
+    """Packages that are missing of each extra for users; None if nothing is installed."""
     try:
         requirements = metadata.requires(distribution) or []
     except metadata.PackageNotFoundError:

@@ -44,10 +44,10 @@ def envmap(asked: EnvmapOptions) -> Comparison | None:
     Light and albedo share a factor per channel that photographs hardly fix; the comparison takes it
     out, the file holds the map as it is. The true map is envmaps/train.hdr or .exr in the data set.
     The picture goes to the same name with .png: a row for the recovered map and one for the true
-    map, each with a grey and a mirror ball seen from +X, +Z up.
+    map, each with a grey and a chrome sphere seen from +X, +Z up.
 
     Returns:
-        None where the data set has no true map.
+        None if the data set has no true map.
 
     Raises:
         DataError: run or true map cannot be read.

@@ -90,7 +90,7 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
     doubt.roughness in [0, 1], 0 where nothing is; alpha; depth along -Z, 0 where nothing is. With
     `full_size` NAME_full.exr comes beside it, rgb.* and alpha at the size of the photograph, and
     the keys of `univoxel.detail.views.FULL_MEASURES` are in the result. The
-    file `json` holds the measures; `complete` and `verdict`, how training came out, None where that
+    file `json` holds the measures; `complete` and `verdict`, how training came out, None if that
     is not known; and the figures of trust.txt under the key trust.
 
     Raises:
@@ -177,7 +177,7 @@ def _at_full_size(
 
     try:
         train = photos_of(run, data, "train")
-    except (UserError, OSError) as error:  # views are the model's alone
+    except (UserError, OSError) as error:  # views are the model's only
         log.info("full size: novel views without photographs: %s", error)
         train = None
     return dict(measure_full_size(scene, run, photos, train, save))

@@ -85,9 +85,9 @@ def info(asked: InfoOptions) -> dict[str, Any]:
     Returns:
         JSON: `parameters`, `bytes`, `parts` (name: parameters and bytes), `grid` (size, voxel_size,
         nodes, and shares of them: with distances, with features), `channels`,
-        `material_channels`, `hidden`, `lobes` (None where there are none), `chosen`: what,
+        `material_channels`, `hidden`, `lobes` (None if there are none), `chosen`: what,
         before, after, cost in dB and why; `cameras`, see `camera_check`; `said`,
-        how training came out in words, `result`, as verdict.json has it, None where it has not.
+        how training came out in words, `result`, as verdict.json has it, None if it has not.
 
     Raises:
         UserError: no model there, or one that cannot be read.
@@ -124,7 +124,7 @@ def info(asked: InfoOptions) -> dict[str, Any]:
 def camera_check(scene: Scene, run: Path) -> dict[str, Any] | None:
     """How far points that are matched between the photographs of a run lie from their epipolar
     lines: `matches`, `refined`, and `given` and `used` (median and 90 %, pixels) for the cameras as
-    they were given and as the scene has them. None where too few points match, or where the
+    they were given and as the scene has them. None if too few points match, or where the
     photographs cannot be read any more."""
     from univoxel.preparation.hull import mask_distances
     from univoxel.preparation.matches import agreement, find_matches

@@ -1,6 +1,6 @@
 """Arguments of the command line: which command is meant, how options are written, completion.
 
-The options of a command are a record: what stands under a field is its help.
+The options of a command are a record: what is under a field is its help.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Result: TypeAlias = int | Path | Sequence[Path] | None
 Command: TypeAlias = Callable[..., Result]
 Shell: TypeAlias = Literal["bash", "zsh", "fish"]
 
-LAB = "lab"  # the word before commands of the laboratory
+LAB = "lab"  # the word before commands of the experiments
 WIDTH, COLUMN = 100, 22  # of help, and where texts begin in it
 GROUPED = 12  # arguments; commands with more list the advanced ones apart
 UNSAID = {"default: None", "default: False", "default: ", "default: none", "repeatable"}
@@ -67,7 +67,7 @@ def written(metavar: str | None = None, default: str | None = None, **other: Any
 ADVANCED = Written(advanced=True)
 
 # Options of several commands
-File: TypeAlias = Path | str  # text in the library alone: the command line makes paths
+File: TypeAlias = Path | str  # text in the library only: the command line makes paths
 Run: TypeAlias = Annotated[File, written("RUN", positional=True)]
 AtOnce: TypeAlias = Annotated[int, written("N")]
 Scheduler: TypeAlias = Annotated[str | None, written("ADDRESS", "this machine", advanced=True)]
@@ -125,7 +125,7 @@ def parse(
 
     Args:
         commands: by name.
-        prefix: what stands before their names.
+        prefix: what is before their names.
 
     Raises:
         Usage: they make no command.
@@ -206,10 +206,10 @@ def documentation(command: Command) -> str:
 
 
 def meanings(record: type) -> dict[str, str]:
-    """What stands under each field of a record, in one line; nothing where there is no source.
+    """What is under each field of a record, in one line; nothing if there is no source.
 
     Args:
-        record: a class that stands in one file with its bases.
+        record: a class that is in one file with its bases.
     """
     try:
         tree = ast.parse(inspect.getsource(sys.modules[record.__module__]))
@@ -335,14 +335,14 @@ def completion(shell: Shell, commands: Mapping[str, Command], lab: Mapping[str, 
     """The script that makes a shell complete commands, options and their choices.
 
     Args:
-        lab: commands of the laboratory; none where it is not there.
+        lab: commands of the experiments; none where it is not there.
     """
 
     import tyro
     from tyro.conf import ConsolidateSubcommandArgs, FlagCreatePairsOff, OmitSubcommandPrefixes
 
     def laboratory(command):
-        """Commands of the laboratory."""
+        """Commands of the experiments."""
 
     if lab:
         laboratory.__annotations__["command"] = Annotated[_union(lab), OmitSubcommandPrefixes]

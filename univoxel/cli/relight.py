@@ -278,7 +278,7 @@ def relight_images(
 
     Args:
         run: folder of the trained scene.
-        envmap: a file, a map, or None for the suns and point lights alone.
+        envmap: a file, a map, or None for the suns and point lights only.
         cameras, options: fields of `RelightOptions`.
 
     Raises:

@@ -110,7 +110,7 @@ def _train(
     check_memory(photos, cfg)
     begun = resumed(cfg) if resume else None
     state = begun[1] if begun else {}
-    (cfg.out / VERDICT).unlink(missing_ok=True)  # of a run that goes on
+    (cfg.out / VERDICT).unlink(missing_ok=True)  # of a run that continues
     shutil.rmtree(cfg.out / "detail", ignore_errors=True)  # as well
 
     begin -= state.get("seconds", 0.0)
@@ -209,7 +209,7 @@ def build_field(prepared: Prepared, cfg: config.TrainConfig) -> Field:
 
 
 def resumed(cfg: config.TrainConfig) -> tuple[Scene, dict[str, Any]] | None:
-    """The scene that a run goes on with, and its state; None where nothing was saved yet.
+    """The scene that a run continues with, and its state; None if nothing was saved yet.
 
     Raises:
         UserError: the checkpoint cannot be read, or it belongs to another configuration.
@@ -330,7 +330,7 @@ def bring_to_grid_(
 
 
 def trusted(scene: Scene, photos: Photos) -> Survey | None:
-    """What the photographs leave open; None where there is no surface that they show."""
+    """What the photographs leave open; None if there is no surface that they show."""
     try:
         return survey(scene, photos, REPORT_POINTS)
     except UserError as error:

@@ -105,7 +105,7 @@ FILE = "steps.json"
 
 
 def finish(folder: Path, step: str, fingerprint: Any) -> None:
-    """Note that a step is done; the folder is made where there is none."""
+    """Note that a step is done; the folder is made if there is none."""
     _write(folder, _read(folder) | {step: fingerprint})
 
 

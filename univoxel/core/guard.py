@@ -1,6 +1,6 @@
 """Processes of Python that end with the one that began them, and run its package.
 
-A process that is killed cannot end those that it began. They would go on alone, and write into
+A process that is killed cannot end those that it began. They would continue alone, and write into
 files beside those that are begun again.
 
 Python looks for modules in the working folder first, which may be anybody's: a folder of

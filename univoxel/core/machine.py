@@ -1,4 +1,4 @@
-"""The machine that a program runs on: processor, cores, memory. None where it does not say."""
+"""The machine that a program runs on: processor, cores, memory. None if it does not say."""
 
 from __future__ import annotations
 

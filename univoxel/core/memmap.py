@@ -67,7 +67,7 @@ def reserve(descriptor: int, size: int, place: Path) -> None:
     """Make an open file as long, on the disk too: where that is full later, the process would end.
 
     Args:
-        place: that an OSError names where there is no room.
+        place: that an OSError names if there is no room.
     """
     try:
         system.reserve(descriptor, size)

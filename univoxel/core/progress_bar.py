@@ -19,7 +19,7 @@ from univoxel.core import log
 
 T = TypeVar("T")
 
-LINE_SECONDS = 10.0  # between lines, where there is no bar
+LINE_SECONDS = 10.0  # between lines, if there is no bar
 
 
 class _Lines(Progress):

@@ -57,7 +57,7 @@ def without_retired(kind: Any, values: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if name not in gone}
 
 
-# Meaning, unit and range of a field stand in its metadata, once: checks and the reference page are
+# Meaning, unit and range of a field are in its metadata, once: checks and the reference page are
 # derived from there.
 
 

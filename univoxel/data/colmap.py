@@ -174,7 +174,7 @@ def _models(folder: Path) -> list[tuple[Path, str]]:
 
 
 def _ending(model: Path) -> str | None:
-    """The ending of a model's files; None where there is no model."""
+    """The ending of a model's files; None if there is no model."""
     for ending in (".bin", ".txt"):
         if all((model / f"{name}{ending}").is_file() for name in ("cameras", "images")):
             return ending

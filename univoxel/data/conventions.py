@@ -43,7 +43,7 @@ def turned_up(
 
 
 def listed_split(folder: Path, shots: Sequence[Shot], split: str) -> list[Shot]:
-    """The split of train_id.txt and test_id.txt, as of Stanford-ORB; without, every eighth."""
+    """The split of train_id.txt and test_id.txt, as in Stanford-ORB; without, every eighth."""
     files = {name: folder / f"{name}_id.txt" for name in ("train", "test")}
     if split not in files or not all(file.is_file() for file in files.values()):
         return every_eighth(folder, shots, split)

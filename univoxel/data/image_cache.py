@@ -79,7 +79,7 @@ def to_be_kept(views: int, height: int, width: int) -> bool:
 @dataclass
 class Reading:
     """Photographs while they are read, one after the other: in memory, or where they are large in
-    the file where they are kept. There, reading that was ended goes on where it was."""
+    the file where they are kept. There, reading that was ended continues where it was."""
 
     color: Tensor  # [V, H, W, 3]
     alpha: Tensor  # [V, H, W]
@@ -220,7 +220,7 @@ def keep_photos(photos: Photos, path: Path) -> None:
 
 
 def _origin_in(path: Path) -> str | None:
-    """The origin of what a file holds; None where there is no file of this kind."""
+    """The origin of what a file holds; None if there is no file of this kind."""
     try:
         with safe_open(path, "pt") as file:
             return (file.metadata() or {}).get("origin")

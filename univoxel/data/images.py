@@ -197,9 +197,9 @@ FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")
 KINDS = {".exr": "an OpenEXR file", ".tif": "a TIFF", ".tiff": "a TIFF", ".webp": "a WebP"}
 # Axes that are flipped, by orientation in EXIF
 FLIPPED: dict[int, tuple[int, ...]] = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}
-HEIF = (".heic", ".heif", ".avif")  # of telephones
+HEIF = (".heic", ".heif", ".avif")  # of phones
 HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"mif1", b"msf1", b"avif", b"avis")
-LARGEST = 1 << 29  # pixels of a file: panoramas and the largest telephones have 200 million
+LARGEST = 1 << 29  # pixels of a file: panoramas and the largest phones have 200 million
 MOST_FRAMED = 1 << 29  # pixels of an EXR's display window, at most, where its data fill it in part
 # Endings of pictures that are not read: names may be those of files before they were converted
 FOREIGN = (*HEIF, ".hif", ".bmp", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
@@ -209,7 +209,7 @@ def read_image(path: str | Path, in_srgb: bool = False, infinite: bool = False) 
     """Read a picture, row 0 on top, channels in the order RGB(A) or grey.
 
     Args:
-        in_srgb: turn colours of a profile that the file holds, as of telephones, into sRGB.
+        in_srgb: turn colours of a profile that the file holds, as in phones, into sRGB.
         infinite: let an OpenEXR file hold infinity.
 
     Returns:
@@ -248,7 +248,7 @@ def read_image(path: str | Path, in_srgb: bool = False, infinite: bool = False) 
 
 def kind_of(path: Path) -> str:
     """.exr or .hdr where a file is of that kind by its first bytes, otherwise what its name says; a
-    DataError where there is no such file, or it is empty."""
+    DataError if there is no such file, or it is empty."""
     _require_file(path)
     with path.open("rb") as file:
         head = file.read(4)
@@ -256,7 +256,7 @@ def kind_of(path: Path) -> str:
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """Width and height of a picture that Pillow or OpenEXR reads, from its beginning alone.
+    """Width and height of a picture that Pillow or OpenEXR reads, from its beginning only.
 
     Raises:
         DataError: the file is missing, empty, or not what its name says.

@@ -122,7 +122,7 @@ def require_all(where: Path, photographs: Named, masked: Sequence[bool]) -> None
 
 
 def masks_beside(photographs: Named) -> list[Path | None]:
-    """The mask of each photograph that lies beside it, such as IMG_1_mask.png.
+    """The mask of each photograph that is beside it, such as IMG_1_mask.png.
 
     Raises:
         DataError: two masks are of one photograph.
@@ -477,7 +477,7 @@ def made_upright(pairs: Sequence[tuple[Path, Path]]) -> bool | None:
         pairs: photographs and their masks.
 
     Returns:
-        None where no photograph is turned without its mask.
+        None if no photograph is turned without its mask.
     """
     asked = [(image, mask) for image, mask in pairs if orientation(image) != 1 == orientation(mask)]
     if not asked:

@@ -249,7 +249,7 @@ def _text(data: bytes, errors: str = "strict") -> str:
 
 
 def _delimiter(line: str) -> str | None:
-    """What stands between the names of the columns; None where it is no line of them."""
+    """What stands between the names of the columns; None if it is no line of them."""
     return next((d for d in DELIMITERS if set(REQUIRED) <= set(_columns(line, d))), None)
 
 
@@ -304,7 +304,7 @@ def _row_pose(row: dict[str, str], where: str) -> np.ndarray:
 # Polycam's raw data, as its developer mode exports them.
 #
 # keyframes/corrected_cameras/<time>.json    fx, fy, cx, cy, width, height, and t_00 to t_23:
-#                                            camera-to-world, axes as of ARKit; or keyframes/cameras
+#                                            camera-to-world, axes as in ARKit; or keyframes/cameras
 # keyframes/corrected_images/<time>.jpg      photographs; or keyframes/images
 # keyframes/masks/<time>.png                 masks, which Polycam does not make; or masks
 #

@@ -410,7 +410,7 @@ def _mask(folder: Path, frame: dict[str, Any], where: str) -> Path | None:
 # <file_path>_rgba.png        the same
 # <file_path>_rgb.exr         linear photograph, with <file_path>_mask.png
 # train/0001.exr              linear photograph, with train_mask/0001.png
-# transforms_novel.json       views of other scenes, as of Stanford-ORB: split "novel"
+# transforms_novel.json       views of other scenes, as in Stanford-ORB: split "novel"
 
 
 def is_blender(folder: Path, split: str) -> bool:

@@ -143,7 +143,7 @@ MAP_ENDINGS = (".hdr", ".exr")
 
 
 def load_truth(photos: Photos, view: int) -> Truth:
-    """Ground truth of a test view; an empty record where there is none.
+    """Ground truth of a test view; an empty record if there is none.
 
     The mask is where alpha > 250 of 255, so that no silhouette pixel counts: that of the npz, or of
     the photograph.
@@ -206,7 +206,7 @@ def load_relit(photos: Photos, map: str) -> tuple[Tensor, Tensor]:
 
 
 def load_points(folder: str | Path) -> Tensor | None:
-    """Points [P, 3] float32 on the true surface, world: points.npz, or None where there is none."""
+    """Points [P, 3] float32 on the true surface, world: points.npz, or None if there is none."""
     path = Path(folder) / "points.npz"
     if not path.is_file():
         return None

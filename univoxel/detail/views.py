@@ -70,7 +70,7 @@ class DetailedViews:
     """Renders a scene with its detail."""
 
     def __init__(self, scene: Scene, detail: Detail, photos: Photos | None = None) -> None:
-        """With the photographs that were trained on, or None: views are the model's alone."""
+        """With the photographs that were trained on, or None: views are the model's only."""
         self.scene: Scene = scene
         self.detail: Detail = detail
         self.at: Vertices = vertices_of(scene, Mesh(detail.vertices, detail.faces))
@@ -87,7 +87,7 @@ class DetailedViews:
     def render(
         self, cameras: Cameras, view: int, coarse: Tensor, opacity: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """A view, premultiplied and linear [H, W, 3], and the same by the model alone.
+        """A view, premultiplied and linear [H, W, 3], and the same by the model only.
 
         Args:
             cameras: with pictures of the size that is asked for.
@@ -244,7 +244,7 @@ class Likeness:
 
 def likeness(picture: Tensor, photo: Tensor, cover: Tensor) -> Likeness | None:
     """How like a picture [H, W, 3] is to a photograph, both linear, where `cover` [H, W] is the
-    object; None where too little of it is.
+    object; None if too little of it is.
 
     The object is made smaller by EDGE, so that its silhouette does not count. Octave k is the
     difference of the grey values under Gaussians of 0.85 2^(k-1) and 0.85 2^k pixels: periods of

@@ -45,7 +45,7 @@ from univoxel.sphere import fibonacci_sphere, gaps, side_of
 
 
 POINTS = 20_000  # of the surface that evaluation surveys, for its maps of doubt
-REPORT_POINTS = 2_000  # of the surface that are surveyed after training, for words alone
+REPORT_POINTS = 2_000  # of the surface that are surveyed after training, for words only
 
 # Observations of a point that are rendered again, at most
 OBSERVATIONS = 8
@@ -104,7 +104,7 @@ class Survey:
 
     @property
     def information(self) -> Tensor:
-        """That photographs have of roughness, over that of knowing [0, 1] alone, whose variance is
+        """That photographs have of roughness, over that of knowing [0, 1] only, whose variance is
         1/12: each sRGB value has the noise NOISE."""
         return (self.gloss / NOISE).square() / 12
 
@@ -436,7 +436,7 @@ def advise(
     Args:
         surveyed: what the photographs fix.
         cameras, names: of the photographs, V >= 1.
-        surface: what stands in the way.
+        surface: what is in the way.
     """
     low, high = surveyed.position.amin(0), surveyed.position.amax(0)
     middle = (low + high) / 2
@@ -498,7 +498,7 @@ def _shown(surveyed: Survey, surface: VisibilityScene, eye: Tensor) -> Tensor:
 
 def _agreeing(surveyed: Survey) -> Tensor:
     """`Survey.agreeing` [P] beside the best of the surface, in [0, 1]: what disagrees everywhere,
-    as after a short training, is mended by no photograph."""
+    as after a short training, is repaired by no photograph."""
     return (surveyed.agreeing / surveyed.agreeing.quantile(BEST)).clamp_max(1)
 
 

@@ -34,10 +34,10 @@ class Layers:
 
     rgb: Tensor  # [H, W, 3] physically based render
     albedo: Tensor  # [H, W, 3]
-    roughness: Tensor  # [H, W], 0 where nothing is
-    normal: Tensor  # [H, W, 3] world, 0 where nothing is
+    roughness: Tensor  # [H, W], 0 where there is nothing
+    normal: Tensor  # [H, W, 3] world, 0 where there is nothing
     alpha: Tensor  # [H, W]
-    depth: Tensor  # [H, W] along the camera's -Z, world units, 0 where nothing is
+    depth: Tensor  # [H, W] along the camera's -Z, world units, 0 where there is nothing
     relit: dict[str, Tensor]  # [H, W, 3] by map
     relit_scaled: dict[str, Tensor]  # the same with the scaled albedo
     doubt: Tensor | None = None  # [H, W, 2] in [0, 1] of albedo and roughness, 0 where nothing is
@@ -131,9 +131,9 @@ def _relight(relighting: Relighting, name: str, surface: Surface, wo: Tensor) ->
 # differs from photograph to photograph.
 
 
-STEPS = 100  # of Adam, as of NeRD (Boss et al. 2021) and Neural-PIL
+STEPS = 100  # of Adam, as in NeRD (Boss et al. 2021) and Neural-PIL
 RAYS = 2048  # of a step
-LR = 0.05, 0.005  # at begin and end, of log gains and of codes
+LR = 0.05, 0.005  # at the start and the end, of log gains and of codes
 
 
 def fit_light_(
@@ -388,7 +388,7 @@ def doubts_and_errors(layers: Layers, expected: Expected, scales: Scales) -> tup
 
 
 def doubt_correlation(pairs: list[Pairs]) -> float | None:
-    """Rank correlation of doubts and errors over all views; None where there is no truth."""
+    """Rank correlation of doubts and errors over all views; None if there is no truth."""
     known = [pair for pair in pairs if pair is not None]
     if not known:
         return None
@@ -397,7 +397,7 @@ def doubt_correlation(pairs: list[Pairs]) -> float | None:
 
 
 def albedo_scales(scene: Scene, photos: Photos, albedo_near: AlbedoNear | None = None) -> Scales:
-    """The scales over all test views, or 1 where there is no true albedo.
+    """The scales over all test views, or 1 if there is no true albedo.
 
     This is a pass of its own, so that the pass that renders keeps one view in memory.
 
@@ -419,7 +419,7 @@ def albedo_scales(scene: Scene, photos: Photos, albedo_near: AlbedoNear | None =
 
 
 def mesh_chamfer(mesh: Mesh | None, points: Tensor | None) -> float | None:
-    """Chamfer distance of samples of a mesh and points; None where there are none of either."""
+    """Chamfer distance of samples of a mesh and points; None if there are none of either."""
     if mesh is None or points is None or not len(mesh.faces):
         return None
     count = min(len(points), SURFACE_POINTS)

@@ -33,7 +33,7 @@ MIN_SHARE = 0.05
 class SurfaceVersion:
     """Which state an sdf is in, told without reading it.
 
-    Notices other memory, as of another grid or after `sdf.data = ...`, and what torch counts:
+    Notices other memory, as in another grid or after `sdf.data = ...`, and what torch counts:
     every change in place of the parameter or of `sdf.detach()`. Changes in place of `sdf.data` are
     the only ones that nobody counts.
     """

@@ -51,7 +51,7 @@ class ViewLights(nn.Module):
         """
         Args:
             names: of the V views, in the order of their numbers.
-            codes: Z, >= 0; 0: the views differ by gains alone.
+            codes: Z, >= 0; 0: the views differ by gains only.
             directions: [D, 3] unit, of the scene's map, where it may differ from view to view.
             generator: draws the first codes.
         """
@@ -119,7 +119,7 @@ class ViewLights(nn.Module):
         return self.log_gain[view].exp()
 
     def code(self, view: Tensor | int | None = None) -> Tensor | None:
-        """[N, Z] of views [N]; [Z] for one view, or none. None where only gains differ."""
+        """[N, Z] of views [N]; [Z] for one view, or none. None if only gains differ."""
         if self.raw_codes is None:
             return None
         view = self.chosen if view is None else view
@@ -130,7 +130,7 @@ class ViewLights(nn.Module):
         return codes[view]
 
     def sky_change(self) -> Tensor | None:
-        """What each view adds to the log map: [V, D, 3]; None where all have one map."""
+        """What each view adds to the log map: [V, D, 3]; None if all have one map."""
         if self.sky_weights is None or self.sky_basis is None:
             return None
         return torch.einsum("vrc,rd->vdc", _centred(self.sky_weights), self.sky_basis)
@@ -252,7 +252,7 @@ class Turntable(Table):
     """How an object was turned before a camera and a light that stood still.
 
     In the world, which is the object's, the light turns about the axis as the camera does. Its own
-    frame is the world as it was when the camera stood at `start`. An object that was laid anew, to
+    frame is the world as it was when the camera stood at `start`. An object that was laid again, to
     show its underside, has another axis for the photographs since then.
     """
 

@@ -142,11 +142,11 @@ def differentiable(
         forward: calls the kernel, where it takes its arguments in another order.
         backward: likewise. If the op has an option `sparse_grad` and it is true, backward is called
             without an op: sizes of gradients may then depend on values.
-        held: how many outputs, the last ones, serve the backward pass alone. They have no gradient
+        held: how many outputs, the last ones, serve the backward pass only. They have no gradient
             and are saved after the tensors.
         optional: those of `to` whose gradient is an empty array where it is not needed. The kernel
             computes the others always.
-        traced: backward is made of torch's operations and is no op. It takes what is held alone.
+        traced: backward is made of torch's operations and is no op. It takes what is held only.
     """
     return lambda allocate: Differentiable(
         name or allocate.__name__.removeprefix("_"),

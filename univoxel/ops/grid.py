@@ -67,10 +67,10 @@ def gradients(
     needs: list[bool],
     sparse: bool,
 ) -> list[Tensor | None]:
-    """Gradients to sdf, features and points; None where not needed.
+    """Gradients to sdf, features and points; None if not needed.
 
     Args:
-        sparse: those to sdf and features hold touched rows alone.
+        sparse: those to sdf and features hold touched rows only.
     """
     sdf, features, points, order = inputs
     core, threads = native.require(), native.threads()

@@ -208,11 +208,11 @@ def gradients(
     needs: list[bool],
     sparse: bool,
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Gradients to table and points; None where not needed.
+    """Gradients to table and points; None if not needed.
 
     Args:
         place: as the extension takes it.
-        sparse: that to the table holds touched rows alone.
+        sparse: that to the table holds touched rows only.
     """
     touched = rows = of_table = None
     if needs[0] and sparse:

@@ -20,7 +20,7 @@ def mlp(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tenso
 
     Args:
         x: [N, A] any number of rows.
-        weights: one [out, in] a layer, as of torch.nn.Linear; every size at least 1.
+        weights: one [out, in] a layer, as in torch.nn.Linear; every size at least 1.
         biases: one [out] a layer.
 
     Returns:

@@ -30,7 +30,7 @@ def adam_rows_(
         param = param - lr / (1 - beta1^step) m / (sqrt(v / (1 - beta2^step)) + eps)
 
     The moments of a row decay only when the row is touched, while the bias correction counts the
-    steps of the whole table, as in ``torch.optim.SparseAdam``. eps stands beside the corrected root
+    steps of the whole table, as in ``torch.optim.SparseAdam``. eps is beside the corrected root
     as in ``torch.optim.Adam``, so that an eps which matters means the same for rows as for dense
     tensors; SparseAdam adds it to the root before the correction.
 

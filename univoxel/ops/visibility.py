@@ -125,7 +125,7 @@ class VisibilityScene:
         return hit
 
     def native(self) -> Any:
-        """The native scene, or None where the reference is asked for; for ops that trace rays."""
+        """The native scene, or None if the reference is asked for; for ops that trace rays."""
         if native.reference_asked():
             return None
         if self._native is None:

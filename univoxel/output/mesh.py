@@ -32,7 +32,7 @@ FARTHEST = 1000  # sides of an object that a data set's origin may be away: floa
 
 @dataclass(frozen=True)
 class TexturedMesh:
-    """Triangles with textures, counter-clockwise seen from outside; a vertex stands in one chart.
+    """Triangles with textures, counter-clockwise seen from outside; a vertex is in one chart.
 
     Row 0 of a texture is on top, at v = 1. The field's normal at a texel is the unit vector along
 
@@ -214,7 +214,7 @@ def nearest_surface(
     two voxels away (the mesh cuts a corner, the field is no distance) they end there.
 
     Args:
-        known: points of the zero level, see `surface_beside`. The nearest stands in for one that
+        known: points of the zero level, see `surface_beside`. The nearest is in for one that
             ends off it, as on the cap of a surface that the grid's border cuts.
     """
     x, reach = points, REACH * field.voxel_size

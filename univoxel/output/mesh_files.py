@@ -294,7 +294,7 @@ def write_obj(path: Path, mesh: TexturedMesh, jpeg: int | None = None) -> None:
     """Write NAME.obj, NAME.mtl and NAME_{albedo,roughness,normal}.png, each whole or not at all.
 
     A mesh with metal has a NAME_metallic.png besides. Positions stay in the world's axes, +Z up.
-    The .obj comes last: where it is, the others are. Roughness, metallic and normal map stand in
+    The .obj comes last: where it is, the others are. Roughness, metallic and normal map are in
     the widespread extension for physically based materials (Pr, Pm, map_Pr, map_Pm, norm); OBJ has
     no tangents, programs compute their own.
 

@@ -341,7 +341,7 @@ def attributes(found: Transfer) -> dict[str, Tensor]:
 
 
 def lights_of(scene: Scene, options: PageOptions) -> list[Light]:
-    """The recovered map where there is one, those given, the usual ones of other names."""
+    """The recovered map if there is one, those given, the usual ones of other names."""
     sky = scene.environment()
     own = [] if sky is None else [Light(RECOVERED, scene.exposed(sky.latlong(MAP_ROWS)))]
     own += [light_of_file(Path(path)) for path in options.envmaps]

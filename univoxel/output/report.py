@@ -59,7 +59,7 @@ class StageFacts:
 
 
 def curves(run: Path) -> list[Curve]:
-    """Loss and held-out quality over time; empty where the log cannot be read."""
+    """Loss and validation PSNR over time; empty where the log cannot be read."""
     losses: list[list[tuple[float, float]]] = []
     qualities: list[list[tuple[float, float]]] = []
     stage, resumed = None, 0.0
@@ -87,7 +87,7 @@ def curves(run: Path) -> list[Curve]:
 
 
 def configuration(run: Path) -> TrainConfig | None:
-    """What the run was trained with; None where its config.json cannot be read."""
+    """What the run was trained with; None if its config.json cannot be read."""
     try:
         return load_config(run / "config.json")
     except (UserError, OSError) as error:

@@ -114,7 +114,7 @@ def compared(
 
 
 def on_grey(premultiplied: Tensor, alpha: Tensor) -> Tensor:
-    """Linear colours [h, w, 3], premultiplied, as sRGB on what stands behind them in a report."""
+    """Linear colours [h, w, 3], premultiplied, as sRGB on what is behind them in a report."""
     straight = premultiplied / alpha[..., None].clamp_min(1e-6)
     return linear_to_srgb(straight) * alpha[..., None] + BEHIND * (1 - alpha[..., None])
 

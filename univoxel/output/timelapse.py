@@ -44,7 +44,7 @@ def require(kind: str) -> None:
 def write_animation(path: Path, pictures: Sequence[Path], rate: int = FRAMES_PER_SECOND) -> None:
     """Write pictures, on white where they are transparent, `rate` a second.
 
-    Of differing sizes, they stand in the middle of frames that hold the largest. Whole or not at
+    Of differing sizes, they are in the middle of frames that hold the largest. Whole or not at
     all; a GIF runs in a loop; an MP4 is H.264, cut to even sizes.
 
     Raises:

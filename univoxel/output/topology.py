@@ -1,6 +1,6 @@
 """Which triangles an exported mesh keeps: cleaning, closing and decimation.
 
-Functions take and give the geometry alone, and what is seen of it where that is known; what else a
+Functions take and give the geometry only, and what is seen of it where that is known; what else a
 mesh carries at its vertices is dropped.
 """
 

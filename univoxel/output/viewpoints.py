@@ -43,7 +43,7 @@ def frames_of(names: list[str], lights: Iterable[str], turn: int | None) -> list
     """Frames by view, so that a view's surface serves all its lights.
 
     Args:
-        turn: frames of a turn of the light seen by the first camera alone; None for every camera
+        turn: frames of a turn of the light seen by the first camera only; None for every camera
             under still light.
     """
     if turn is not None and turn < 1:

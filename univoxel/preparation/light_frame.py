@@ -105,7 +105,7 @@ def _correlation(
 
 # Photographs of a turntable whose cameras do not stand on the circle of the others.
 #
-# Structure from motion that finds too few matches somewhere goes on from there a few degrees off.
+# Structure from motion that finds too few matches somewhere continues from there a few degrees off.
 # Silhouettes and matches of pairs hardly show it: along the circle a round object looks alike, and
 # what is matched moves along the lines that it is held against.
 
@@ -156,7 +156,7 @@ def say_strays(photos: Photos) -> None:
 # light turns as the camera does. Then a point is bright where its normal faces the light as seen
 # from the camera. Under a light that stands still a point keeps its shade, and changes only by what
 # it mirrors. Each is a smooth function on the sphere. It is fitted to half of the photographs, and
-# the other half says how well it foretells them: the light that does better there is believed.
+# the other half says how well it predicts them: the light that does better there is believed.
 
 
 # Points of the surface whose colours are compared
@@ -169,7 +169,7 @@ CAUCHY = 0.1
 ROUNDS = 6
 # Standard errors, over the photographs, by which a turning light has to be ahead of a still one
 CERTAIN = 2.0
-# Share of the shade of a flash that points show at least where there is one: paint does. Elsewhere
+# Share of the shade of a flash that points show at least if there is one: paint does. Elsewhere
 # it was -0.4 to 0, for towards the outline surfaces do not become darker
 SHADE = 0.1
 # Natural log by which points that face the camera are brighter than others at least, if they do not
@@ -184,7 +184,7 @@ LEAST = 0.03
 
 @dataclass(frozen=True)
 class Explained:
-    """How well either light foretells photographs that it was not fitted to."""
+    """How well either light predicts photographs that it was not fitted to."""
 
     # Shares of the robust cost of how points change that go away
     by_still_light: float
@@ -271,7 +271,7 @@ def light_frame_of(
 
 @dataclass(frozen=True)
 class Flashed:
-    """How well a flash foretells photographs that it was not fitted to."""
+    """How well a flash predicts photographs that it was not fitted to."""
 
     shade: float  # share of the shade of a flash alone that points show
     glint: float  # natural log by which points that face the camera are brighter than others
@@ -281,7 +281,7 @@ class Flashed:
 
 @torch.no_grad()
 def explained_by_flash(observations: Observations, gains: Tensor | None = None) -> Flashed:
-    """How well a flash foretells how points change from photograph to photograph.
+    """How well a flash predicts how points change from photograph to photograph.
 
     It lights a point by the cosine to the camera over the squared distance. The surroundings light
     it too, so that it shows only a share of that. What is glossy shows its highlight where it faces
@@ -311,9 +311,9 @@ def explained_by_flash(observations: Observations, gains: Tensor | None = None) 
 def explained(
     observations: Observations, turntable: Turntable, gains: Tensor | None = None
 ) -> Explained:
-    """How well either light foretells how points change from photograph to photograph.
+    """How well either light predicts how points change from photograph to photograph.
 
-    Of photographs in two random halves, each is foretold by what was fitted to the other.
+    Of photographs in two random halves, each is predicted by what was fitted to the other.
 
     Args:
         gains: as of `light_frame_of`.

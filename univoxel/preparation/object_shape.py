@@ -26,7 +26,7 @@ from univoxel.preparation.stereo import DepthMaps, pixels_of, reach
 
 # Gaps that few masks see through, taken out of a hull that the others filled.
 #
-# Between cups on a tray, or under an arch, only pictures from the side see what stands behind. They
+# Between cups on a tray, or under an arch, only pictures from the side see what is behind. They
 # are outvoted, although they are right. A mask that lost a part of the object looks the same in its
 # own picture, but not in those of others: without that part they have something that nothing
 # covers.

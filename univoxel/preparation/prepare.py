@@ -73,7 +73,7 @@ def brightness_of(photos: Photos, sdf: Tensor, grid: GridShape) -> Brightness:
 
     Args:
         photos: V, their cameras where they are believed to be.
-        sdf: [X, Y, Z] world units, such as of the visual hull.
+        sdf: [X, Y, Z] world units, such as in the visual hull.
         grid: of the sdf.
     """
     seen = observe_hull(photos, sdf, grid, POINTS)
@@ -187,7 +187,7 @@ def varying_and_gains(
         hull: [X, Y, Z] sdf of the visual hull, world units.
         grid: of the hull.
         varying: what is known to differ.
-        look: whether to find out if exposures do, where nothing is known to differ.
+        look: whether to find out if exposures do, where there is nothing known to differ.
     """
     if varying == "none" and not look:
         return varying, None
@@ -272,7 +272,7 @@ def find_silhouettes(
             found = doubt_masks(photos, distance, belief)
     except UserError as error:
         raise DataError(f"{cfg.data}: {error}") from None
-    # Rough masks that there was no time to mend are no measure of how sharp edges are
+    # Rough masks that there was no time to repair are no measure of how sharp edges are
     doubted, shape, edges_given = None, None, photos is given and belief.votes == 1
     if found is not None:
         doubted, shape = found.pixels, found.shape
@@ -325,7 +325,7 @@ def pinned_in(
     cfg: TrainConfig,
     begins: Callable[..., bool] = unhurried,
 ) -> PinnedHull | None:
-    """What `prepare` pinned, of a scene that goes on."""
+    """What `prepare` pinned, of a scene that continues."""
     stage = cfg.stages[0]
     assert isinstance(stage, StageConfig)
     light = scene.cfg

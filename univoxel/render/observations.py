@@ -240,7 +240,7 @@ class Mirrors:
 
 @dataclass(frozen=True)
 class MaterialLabels:
-    """What the joint solve has decided so far; replaced as it goes on."""
+    """What the joint optimisation has decided so far; replaced as it continues."""
 
     metal: Tensor  # [P] bool, which points are metal
     sun: Tensor | None = None  # [D, 3] what a sun adds to the log map, which else is smooth
@@ -283,7 +283,7 @@ def has_one_light(scene: Scene, problem: JointProblem) -> bool:
 
 
 def turned_maps(scene: Scene, observations: Observations) -> TurnedMaps | None:
-    """The scene's map in the world of each photograph; None where it is the same for all."""
+    """The scene's map in the world of each photograph; None if it is the same for all."""
     turntable = scene.cfg.turntable
     if turntable is None or scene.sky is None:
         return None

@@ -173,7 +173,7 @@ def sun_entropies(
     """Entropy of the albedos under an even sky with a sun: [K, D], by share and direction.
 
     Args:
-        overcast: [P, 3] irradiance over pi under the even sky alone.
+        overcast: [P, 3] irradiance over pi under the even sky only.
         power: [D, 3] radiance of a node that would send all of the light.
         shares: K, of the light that the sun sends.
     """

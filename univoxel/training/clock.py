@@ -88,7 +88,7 @@ class Clock:
         """
         Args:
             begin: of reading the photographs, by `time.monotonic`.
-            state: as `state` gave it; empty at the begin of a run.
+            state: as `state` gave it; empty at the start of a run.
             slower: how many times as long a step takes here as on the machine of the estimates.
         """
         self.cfg: TrainConfig = cfg
@@ -115,7 +115,7 @@ class Clock:
         self.preparation: float = 0.0  # seconds that preparation is expected to end at
 
     def state(self) -> dict[str, Any]:
-        """What a later sitting needs to go on; JSON."""
+        """What a later sitting needs to continue; JSON."""
         return {
             "stage": self.stage,
             "progress": self.done,

@@ -78,7 +78,7 @@ TEACHING_WEIGHT = 0.1
 ALBEDO_SMOOTHNESS = 0.005
 # Weight of the change of the roughness there
 ROUGHNESS_SMOOTHNESS = 0.02
-# Weight of the cross entropy of metallic and the metal decision
+# Weight of the cross entropy of metallic and the metal classification
 METALLIC_WEIGHT = 0.01
 
 

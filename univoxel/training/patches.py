@@ -35,7 +35,7 @@ MIN_ALPHA = 0.99  # of all pixels of a patch
 MIN_TEXTURE = 0.004  # standard deviation of brightness: about that of rounding to bytes
 NOISE = 0.001  # brightness; patches that vary less correlate less
 # Of what correlation lacks to 1, above which a view pulls no more: something else is seen there, a
-# highlight or what stands before it
+# highlight or what is before it
 MOST = 0.3
 
 

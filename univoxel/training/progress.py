@@ -29,7 +29,7 @@ class CapacityChoice:
     kind: Kind
     before: float  # size; of a reach in voxels, else a count
     after: float
-    cost: float  # dB that held-out rays lost; below 0 they gained
+    cost: float  # dB that validation pixels lost; below 0 they gained
     why: str
 
     @property
@@ -56,13 +56,13 @@ class CapacityChoice:
 
 
 def chosen_voxels(choices: Iterable[CapacityChoice]) -> int | None:
-    """Voxels of the coarsest grid that was chosen; None where none was."""
+    """Voxels of the coarsest grid that was chosen; None if none was."""
     counts = [round(choice.after) for choice in choices if choice.kind == "voxels"]
     return min(counts, default=None)
 
 
 def chosen_reach(choices: Iterable[CapacityChoice]) -> float | None:
-    """Voxels from the surface up to which nodes are stored, as chosen last; None where it was
+    """Voxels from the surface up to which nodes are stored, as chosen last; None if it was
     not."""
     reaches = [choice.after for choice in choices if choice.kind == "reach"]
     return reaches[-1] if reaches else None
@@ -112,7 +112,7 @@ class Listener(Protocol):
         ...
 
     def trouble(self, what: str) -> None:
-        """Tell of something that went wrong and was mended."""
+        """Tell of something that went wrong and was repaired."""
         ...
 
 
@@ -130,7 +130,7 @@ class Progress:
         """
         Args:
             begin: of reading the photographs, on the clock of `time.monotonic`.
-            state: as `state` gave it; empty at the begin of a run.
+            state: as `state` gave it; empty at the start of a run.
             on_progress: called with each report.
             slower: as of `Clock`.
         """
@@ -189,7 +189,7 @@ class Progress:
         )
 
     def state(self) -> dict[str, Any]:
-        """What a later sitting needs to go on, and what evaluation reports; JSON."""
+        """What a later sitting needs to continue, and what evaluation reports; JSON."""
         return self.clock.state() | {
             "within": self.within,
             "chosen": [choice.as_json() for choice in self.chosen],
@@ -204,7 +204,7 @@ class Progress:
         log.info(what)
 
     def trouble(self, what: str) -> None:
-        """Tell, at once and in the log, of something that went wrong and was mended."""
+        """Tell, at once and in the log, of something that went wrong and was repaired."""
         self.troubles.append(what)
         nothing = {"losses": {}, "held_out_psnr": None, "rays_per_second": None}
         self._append(self.state() | nothing | {"trouble": what})

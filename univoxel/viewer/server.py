@@ -49,7 +49,7 @@ from univoxel.viewer.viewer_scene import (
     point_on_mesh,
 )
 
-DARK = "no map"  # the light that leaves the sun alone
+DARK = "no map"  # the light that leaves the sun only
 PLAIN = 0.16  # sRGB, behind a transparent picture
 JPEG = 90  # quality of pictures that are sent
 MAPS = (".hdr", ".exr")

@@ -48,7 +48,7 @@ def hosted(host: str, port: int, title: str) -> Iterator[Any]:
     with _silent():
         server = viser.ViserServer(host=host, port=port, verbose=False)
     try:
-        if port and server.get_port() != port:  # taken in between; viser goes on to the next
+        if port and server.get_port() != port:  # taken in between; viser continues to the next
             raise _taken(host, port)
         _guard(server, host)
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
@@ -65,7 +65,7 @@ def address_of(server: Any, host: str) -> str:
 
 
 def _guard(server: Any, host: str) -> None:
-    """Answer pages of this server alone, and tell nobody outside of it."""
+    """Answer pages of this server only, and tell nobody outside of it."""
 
     def refused(*args: Any, **options: Any) -> None:
         log.warning("refused: a page asked to share the viewer with the network")

@@ -68,7 +68,7 @@ class Subject:
 
 
 def subject_of(run: Path) -> Subject:
-    """The scene of a run's folder, and its mesh; a UserError where there is none."""
+    """The scene of a run's folder, and its mesh; a UserError if there is none."""
     scene = load_scene(run)
     mesh = mesh_of(scene, cameras=cameras_of(scene, run))
     return Subject(scene, traced_mesh(mesh, scene.field.voxel_size), run)
@@ -147,7 +147,7 @@ def incident_light(
 ) -> Tensor:
     """Radiance that arrives at a point from everywhere, linear: [rows, 2 rows, 3].
 
-    Texels are directions as of environment maps. From where the mesh is in the way comes what that
+    Texels are directions as in environment maps. From where the mesh is in the way comes what that
     part of it reflects; from below the horizon comes nothing. A sun is a texel of its irradiance.
     Point lights are left out.
     """
