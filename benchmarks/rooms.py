@@ -359,7 +359,7 @@ def smoothed(picture: np.ndarray, inside: np.ndarray) -> np.ndarray:
     """Linear colour [H, W, 3] with less noise: light is smoothed, and what it shines on is not.
 
     Args:
-        picture: as of `pictured`.
+        picture: as in `pictured`.
         inside: [H, W] the object's silhouette, across which nothing is smoothed.
     """
     shown, colour = despeckled(picture[..., :4])[..., :3], picture[..., 4:] + 0.02

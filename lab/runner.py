@@ -32,7 +32,7 @@ def run(
 
     Raises:
         DataError: a scene cannot be read.
-        UserError: two scenes or settings of one name; as of `run_pairs`.
+        UserError: two scenes or settings of one name; as in `run_pairs`.
         OSError: `out` cannot be written.
     """
     settings = _distinct(settings)

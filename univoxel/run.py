@@ -22,7 +22,7 @@ class Source:
 
     folder: Path
     downscale: int  # pixels of the files along a side of one that was trained on
-    allow_outside: bool  # as of `load_photos`
+    allow_outside: bool  # as in `load_photos`
 
 
 def kept_photos(run: Path, split: str) -> Path:
@@ -60,7 +60,7 @@ WORLD = "world.json"  # in the folder of a run whose world is not that of its da
 
 
 def save_world(moved: np.ndarray | None, run: Path) -> None:
-    """Write how the world of the data's files was moved to that of the run, as of `Photos`.
+    """Write how the world of the data's files was moved to that of the run, as in `Photos`.
 
     Raises:
         OSError: it cannot be written.
@@ -71,7 +71,7 @@ def save_world(moved: np.ndarray | None, run: Path) -> None:
 
 
 def load_world(run: Path) -> np.ndarray | None:
-    """[3, 4], as of `Photos.moved`; None also of runs of earlier versions, which kept none.
+    """[3, 4], as in `Photos.moved`; None also of runs of earlier versions, which kept none.
 
     Raises:
         DataError: the file cannot be read.

@@ -105,7 +105,7 @@ def materials_of(path: Path, metallic: Tensor | None, roughness: Tensor) -> np.n
     """Found and true metal, found and true roughness, and the part: [5, N] of a view's object.
 
     Args:
-        path: truth of the view, as of `lab.stress.scenes.truth_of_view`.
+        path: truth of the view, as in `lab.stress.scenes.truth_of_view`.
         metallic, roughness: [H * W] as recovered; metallic may be missing, where nothing is metal.
     """
     with np.load(path) as arrays:

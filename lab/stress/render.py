@@ -84,7 +84,7 @@ def render_in(module: str, identity: str, folder: Path) -> Path:
         identity: what folder/scene.json says, by which the scene is known.
 
     Raises:
-        UserError, MissingExtra, ProcessFailed, OSError: as of `render`.
+        UserError, MissingExtra, ProcessFailed, OSError: as in `render`.
     """
     if holds(identity, folder):
         return folder

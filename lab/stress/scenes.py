@@ -107,7 +107,7 @@ def environment(spec: Spec, name: str, poles: bool = False) -> np.ndarray:
 
 
 def directions_of_map(height: int, poles: bool) -> np.ndarray:
-    """Unit directions [H, 2H, 3] of a map's texels; `poles` as of `environment`."""
+    """Unit directions [H, 2H, 3] of a map's texels; `poles` as in `environment`."""
     if not poles:
         return latlong_directions(height).double().numpy()
     theta = math.pi / 2 - math.pi * np.arange(height) / (height - 1)

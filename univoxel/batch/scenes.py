@@ -108,7 +108,7 @@ class SceneResult:
     errors: dict[str, str]  # a line each, by step
     seconds: dict[str, float]  # spent in all sittings, by step
     verdict: Word | None = None  # None: it was not trained to an end
-    measures: dict[str, float | int | None] = field(default_factory=dict)  # as of `evaluate`
+    measures: dict[str, float | int | None] = field(default_factory=dict)  # as in `evaluate`
     doubts: dict[str, float] = field(default_factory=dict)  # means over the surface, in [0, 1]
 
     @property

@@ -169,8 +169,8 @@ def cutout(
         out: folder to write.
         source: where masks come from: rembg, from a network; none, from depth only, of what
             stands out from its support in the middle; else a folder of masks.
-        downscale: side of the squares of pixels that become one, 0 as of `load_photos`.
-        allow_outside: as of `load_photos`.
+        downscale: side of the squares of pixels that become one, 0 as in `load_photos`.
+        allow_outside: as in `load_photos`.
         network: which of rembg's networks makes them, if one does.
         box: X0 Y0 Z0 X1 Y1 Z1, world units of the written cameras: what lies outside is not the
             object.

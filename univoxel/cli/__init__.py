@@ -1,7 +1,7 @@
-"""The command line: parse, run one command, turn a user's mistake into one line.
+"""The command line: parse arguments, run one command, print a mistake of the user in one line.
 
-A command is one file: its options, a record, and what it does. Files import torch, and what needs
-it, inside of functions: `univoxel --help` does not wait for it.
+Each command is a file with a record of its options and a function. The files import torch inside
+functions only, so that `univoxel --help` does not wait for it.
 """
 
 from __future__ import annotations
@@ -228,10 +228,10 @@ def lab() -> None:
 
 
 def take_threads(threads: int | None) -> None:
-    """Let kernels, torch and processes begun from here run on so many threads.
+    """Set the number of threads of kernels, torch and child processes.
 
-    None: as many as OMP_NUM_THREADS says, or else as there are cores. Where a control group grants
-    less of those, as in a container, OpenMP does not see it: a thread for each would wait.
+    None: OMP_NUM_THREADS, or else one per core. If a control group grants fewer cores, as in a
+    container, OpenMP does not see it, and the surplus threads would wait.
     """
     if threads is None:
         granted = machine.cores()

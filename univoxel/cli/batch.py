@@ -1,4 +1,4 @@
-"""Many scenes, each through the same steps, on one machine or on a cluster; what came out."""
+"""Process many scenes on one machine or a cluster."""
 
 from __future__ import annotations
 
@@ -112,17 +112,17 @@ def command(asked: BatchOptions) -> None:
 
 
 def batch(asked: BatchOptions, threads: int | None = None) -> list[SceneResult]:
-    """Take scenes through steps, each in processes of its own; return what came out, in order.
+    """Process scenes, each step in its own process; return the results in order.
 
-    index.html, batch.json and batch.csv tell of all of them, and are written again as each ends.
+    index.html, batch.json and batch.csv list all scenes and are updated when one ends.
 
     Args:
-        threads: of each scene; None: as the machine allows.
+        threads: threads per scene; None: as the machine allows.
 
     Raises:
-        UserError: an argument cannot be used, Dask is missing, or out holds scenes that other
-            options made; nothing was begun.
-        ProcessFailed: the scheduler does not answer, or is gone.
+        UserError: an argument cannot be used, Dask is missing, or out holds scenes that were
+            processed with other options; nothing was started.
+        ProcessFailed: the scheduler does not answer, or the connection was lost.
         OSError: out cannot be written.
     """
     from univoxel.batch.jobs import connect, run_jobs

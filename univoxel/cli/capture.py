@@ -1,4 +1,4 @@
-"""From photographs to an object that can be lit anew, in one go: cameras, masks, training, mesh."""
+"""From photographs to a relightable object in one command: cameras, masks, training, mesh."""
 
 from __future__ import annotations
 
@@ -134,30 +134,30 @@ def capture(
     pictures: PicturesConfig = PICTURES,
     **options: Any,
 ) -> Captured:
-    """Make an object that can be lit again from photographs, in steps that are each kept.
+    """Turn photographs into a relightable object, in steps whose results are kept.
 
-    Below `out`: scene/ holds photographs and cameras, cut/ those with masks, run/ the training,
-    pictures/ the object under other light and measures, then the mesh and index.html. What is
-    there is not made again, so the same call continues after an interruption. What is of one's own
-    takes the place of a step: photographs with cameras, masks, a run.
+    The folder `out` then has scene/ (photographs and cameras), cut/ (the same with masks), run/
+    (the training), pictures/ (the object under new light, and metrics), the mesh and index.html.
+    Finished steps are kept: after an interruption, call the function again to resume. If you
+    already have cameras, masks or a run, the steps that make them are skipped.
 
     Args:
-        photographs: a folder of photographs or a video; or photographs with cameras, of any layout
+        photographs: a folder of photographs or a video; or photographs with cameras, in any layout
             that `train` reads; or a trained run.
-        out: folder to write.
-        on_progress: as of `univoxel.train`.
+        out: folder to write to.
+        on_progress: as in `univoxel.train`.
         config: how cameras are found.
-        pictures: how many are made, and how large.
+        pictures: number and size of the images.
         options: fields of `univoxel.cli.capture.CaptureOptions`, such as masks, box, preset and
-            minutes; until stays page, `find_data` makes the first steps only.
+            minutes; until must be page: for the first steps only, call `find_data`.
 
     Raises:
-        ExistingFile: out holds another capture, or what other options made.
+        ExistingFile: out holds another capture, or results of other options.
         MissingExtra: a package that finds cameras, reads a format or makes masks is missing.
         MissingNative: the compiled extension is missing or was built without Embree.
-        DataError: photographs, cameras or masks that cannot be used.
+        DataError: photographs, cameras or masks cannot be used.
         UserError: an argument cannot be used, or there is no surface.
-        ProcessFailed: finding cameras did not end well.
+        ProcessFailed: the search for cameras failed.
         Cancelled: on_progress raised it.
         OSError: a file cannot be written.
     """
@@ -204,13 +204,13 @@ def capture(
 def find_data(
     photographs: str | Path, out: str | Path, config: CaptureConfig = DEFAULTS, **options: Any
 ) -> Path:
-    """The first steps of a capture alone; return the folder to train on. `capture` goes on with it.
+    """Run the first steps of a capture, which `capture` can resume; return the folder to train on.
 
     Args:
-        options: fields of `CaptureOptions`; until cameras, or else masks.
+        options: fields of `CaptureOptions`; until is cameras, or else masks.
 
     Raises:
-        UserError: photographs are a trained run; else as of `capture`.
+        UserError: photographs are a trained run; otherwise as in `capture`.
         OSError: a file cannot be written.
     """
     from univoxel.capture.project import Project, begin, look_at

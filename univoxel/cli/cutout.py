@@ -1,4 +1,4 @@
-"""Cut the object out of photographs without masks."""
+"""Masks for photographs whose cameras are known."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The bundled scene from photographs to a page to light it on."""
+"""The bundled scene, from photographs to a relightable web page."""
 
 from __future__ import annotations
 

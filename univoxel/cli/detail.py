@@ -1,4 +1,4 @@
-"""The albedo of a trained run again, from its photographs at their own size."""
+"""A finer albedo for a trained run, from its full-size photographs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MOST_OF_LIMIT = 0.25  # of the minutes that a training has
 
 @dataclass(frozen=True)
 class DetailOptions:
-    """Where detail comes from, and how fine it becomes.
+    """Photographs and size of the texture.
 
     Raises:
         UserError: size out of range.

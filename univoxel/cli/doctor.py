@@ -1,4 +1,4 @@
-"""Whether this installation can train, on what, and what to do about what it lacks."""
+"""Checks of the installation and the machine, with remedies."""
 
 from __future__ import annotations
 

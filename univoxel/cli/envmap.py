@@ -1,4 +1,4 @@
-"""The recovered environment map as a file, and how far it is from the true one."""
+"""The recovered environment map as a file, and its difference from the true one."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ def command(asked: EnvmapOptions) -> None:
 
 @takes(EnvmapOptions)
 def envmap(asked: EnvmapOptions) -> Comparison | None:
-    """Write the recovered map of a run, and a picture of it beside; compare it with the true one.
+    """Write the recovered environment map of a run and a preview; compare it with the true map.
 
-    Light and albedo share a factor per channel that photographs hardly fix; the comparison takes it
-    out, the file holds the map as it is. The true map is envmaps/train.hdr or .exr in the data set.
-    The picture goes to the same name with .png: a row for the recovered map and one for the true
-    map, each with a grey and a chrome sphere seen from +X, +Z up.
+    Photographs cannot separate the scale of light and albedo, per channel: the comparison removes
+    this scale, but the file holds the map as recovered. The true map is envmaps/train.hdr or .exr
+    in the data set. The preview, a .png of the same name, has a row for the recovered and one for
+    the true map, each with a diffuse and a chrome sphere seen from +X, with +Z up.
 
     Returns:
         None if the data set has no true map.

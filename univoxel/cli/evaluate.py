@@ -1,4 +1,4 @@
-"""A trained scene against the truth of its test views: the measures, and pictures of them."""
+"""Metrics of a trained scene on its test views, and images of them."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def command(asked: EvaluateOptions) -> None:
 
 @parsing.takes(EvaluateOptions, gradients=False)
 def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
-    """Measures of a trained scene on its test views, by the keys of `MEASURES`.
+    """Metrics of a trained scene on its test views, with the keys of `MEASURES`.
 
     Arguments are the fields of `EvaluateOptions`. Pictures are compared as sRGB in [0, 1], whole
     image, composited on black, novel views on `background`. Numbers are means over the views (and

@@ -1,4 +1,4 @@
-"""What a trained model consists of: parameters and bytes by part, and what was chosen for it."""
+"""Parts of a trained model with their parameters and bytes, and the sizes chosen for it."""
 
 from __future__ import annotations
 
@@ -77,10 +77,10 @@ def command(asked: InfoOptions) -> None:
 
 @takes(InfoOptions)
 def info(asked: InfoOptions) -> dict[str, Any]:
-    """What the model of a run takes up and where, and whether photographs agree with its cameras.
+    """Sizes of the model of a run, and the epipolar error of its cameras.
 
-    Parameters are the learned numbers that the file holds: distances and features of the nodes it
-    stores, weights, light. Row numbers and directions of the map are bytes, and no parameters.
+    Parameters are the learned numbers in the file: distances and features of the stored nodes,
+    weights and light. Row numbers and directions of the map count as bytes only.
 
     Returns:
         JSON: `parameters`, `bytes`, `parts` (name: parameters and bytes), `grid` (size, voxel_size,
@@ -122,10 +122,9 @@ def info(asked: InfoOptions) -> dict[str, Any]:
 
 
 def camera_check(scene: Scene, run: Path) -> dict[str, Any] | None:
-    """How far points that are matched between the photographs of a run lie from their epipolar
-    lines: `matches`, `refined`, and `given` and `used` (median and 90 %, pixels) for the cameras as
-    they were given and as the scene has them. None if too few points match, or where the
-    photographs cannot be read any more."""
+    """Epipolar error of points that are matched between the photographs of a run: `matches`,
+    `refined`, and `given` and `used` (median and 90 %, pixels) for the given cameras and those of
+    the scene. None if too few points match, or the photographs cannot be read."""
     from univoxel.preparation.hull import mask_distances
     from univoxel.preparation.matches import agreement, find_matches
     from univoxel.run import photos_of

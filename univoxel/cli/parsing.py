@@ -1,6 +1,6 @@
-"""Arguments of the command line: which command is meant, how options are written, completion.
+"""Arguments of the command line: commands, options, help and shell completion.
 
-The options of a command are a record: what is under a field is its help.
+The options of a command are a record; the docstring under a field is its help.
 """
 
 from __future__ import annotations

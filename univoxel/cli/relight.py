@@ -1,4 +1,4 @@
-"""A trained scene under new light, from the test views, an orbit or given cameras."""
+"""Render a trained scene under new light, from the test views, an orbit or given cameras."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NO_MAP = "lights"  # name of light without a map
 
 @dataclass(frozen=True, kw_only=True)
 class Where:
-    """What is relit, and where the pictures go."""
+    """The run and its light, and where to write the images."""
 
     run: Run
     """folder of a trained run"""
@@ -38,7 +38,7 @@ class Where:
 
 @dataclass(frozen=True, kw_only=True)
 class RelightOptions:
-    """How relit pictures are made.
+    """How images are relit.
 
     Raises:
         UserError: a number is out of range.
@@ -282,7 +282,7 @@ def relight_images(
         cameras, options: fields of `RelightOptions`.
 
     Raises:
-        UserError: as of `relight_to_files`.
+        UserError: as in `relight_to_files`.
     """
     from univoxel.camera import stacked
     from univoxel.output.viewpoints import frames_of, pictures_of

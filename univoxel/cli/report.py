@@ -1,4 +1,4 @@
-"""A trained run as a report: how good it is, where it is in doubt, what to photograph next."""
+"""Report on a trained run: its quality, its uncertainty, and what to photograph next."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ OWN = ("data", "out", "config", "minutes", "downscale", "allow_outside", "seed",
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
-    """What is trained, and how; `univoxel.train` takes them too."""
+    """Options of a training; `univoxel.train` has them too."""
 
     data: Annotated[parsing.File, parsing.written("DATA", positional=True)]
     """folder with the photographs and their cameras"""
@@ -125,7 +125,7 @@ class Train(TrainOptions):
     """do not write RUN/index.html"""
 
     def view_at(self) -> tuple[str, int] | None:
-        """Host and port that a training is looked at, if at all; a UserError for one alone."""
+        """Host and port for watching the training, or None; a UserError without --view."""
         host, port = self.host, self.port
         if self.view:
             return "127.0.0.1" if host is None else host, 8080 if port is None else port
@@ -151,7 +151,7 @@ def command(asked: Train) -> int:
 
 
 def code_of(run: Path) -> int:
-    """The exit code of a training: 3 where a stage made no step at all, or else 0."""
+    """The exit code of a training: 3 if a stage made no step at all, else 0."""
     from univoxel.run import load_verdict
 
     verdict = load_verdict(run)

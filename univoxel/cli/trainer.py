@@ -1,4 +1,4 @@
-"""Photographs in, a scene out: what training does, in order."""
+"""The steps of a training, from photographs to a scene."""
 
 from __future__ import annotations
 
@@ -58,12 +58,12 @@ def train(
     on_progress: Callable[[TrainingProgress], None] | None = None,
     view: tuple[str, int] | None = None,
 ) -> Path:
-    """Train a scene; leave model, log, preview, configuration, verdict.json and trust.txt in
+    """Train a scene; write model, log, preview, configuration, verdict.json and trust.txt to
     cfg.out; return it.
 
     Args:
-        resume, timelapse, on_progress, view: as of `univoxel.train`. Where there is no checkpoint
-            to resume from, training begins; making pictures does not count as time.
+        resume, timelapse, on_progress, view: as in `univoxel.train`. If there is no checkpoint to
+            resume from, training starts; recording images does not count as time.
 
     Raises:
         MissingExtra: view without viser.
@@ -223,7 +223,7 @@ def resumed(cfg: config.TrainConfig) -> tuple[Scene, dict[str, Any]] | None:
 
 
 def announce(progress: Progress, photos: Photos) -> None:
-    """Say how long all will take on this machine, and what a limit leaves out."""
+    """Log the expected time on this machine, and what a time limit leaves out."""
     clock, cfg = progress.clock, progress.cfg
     pixels = len(photos) * photos.cameras.width * photos.cameras.height / 1e6
     before = clock.seconds + PREPARATION_SECONDS * progress.slower * pixels
@@ -248,7 +248,7 @@ def announce(progress: Progress, photos: Photos) -> None:
 def evidence(
     scene: Scene, pixels: TrainingPixels, progress: Progress, surveyed: Survey | None
 ) -> Evidence:
-    """What the verdict on a training rests on."""
+    """The evidence for the verdict on a training."""
     clock, held_out = progress.clock, pixels.held_out
     batch = batch_at(scene.registered(pixels.photos), held_out)
     with torch.no_grad():

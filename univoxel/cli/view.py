@@ -1,4 +1,4 @@
-"""A trained scene to look at and to light: in a browser, live, or as one web page."""
+"""View and relight a trained scene in a browser: live, or as a web page."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ def guarded(
     """A process of `command`, which ends with the block at the latest.
 
     Args:
-        arguments: as of `command`.
+        arguments: as in `command`.
         output: takes all that it says.
         options: more of Popen's.
     """

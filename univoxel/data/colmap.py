@@ -43,7 +43,7 @@ class Registered:
 
     camera: int
     name: str  # path within the folder of photographs
-    pose: np.ndarray  # [3, 4] camera-to-world, axes as of `Cameras`
+    pose: np.ndarray  # [3, 4] camera-to-world, axes as in `Cameras`
 
 
 def is_colmap(folder: Path, split: str) -> bool:

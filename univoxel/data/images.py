@@ -327,7 +327,7 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
 
 
 def _read_exr(path: Path) -> tuple[dict[str, np.ndarray], Sequence[float]]:
-    """Channels as of `read_exr`, and the primaries that the file states, if any."""
+    """Channels as in `read_exr`, and the primaries that the file states, if any."""
     _require_file(path)
     try:
         with _exr(path, separate_channels=True) as file:
@@ -587,7 +587,7 @@ def _code_points(path: Path) -> bytes:
 
 
 def _by_profile(picture: Image.Image, profile: bytes) -> Image.Image:
-    """A picture as of `srgb_of`, by an ICC profile. What it is called says nothing."""
+    """A picture as in `srgb_of`, by an ICC profile. What it is called says nothing."""
     alpha = picture.getchannel("A") if picture.mode == "RGBA" else None
     flat = picture.convert("RGB") if alpha else picture
     try:

@@ -64,10 +64,10 @@ class Shot:
     where: str  # for messages: what says that it is there
     image: Path
     mask: Path | None  # a picture of its own that the data name; None: `read_shots` looks for it
-    pose: np.ndarray  # [3, 4] camera-to-world, axes as of `Cameras`
+    pose: np.ndarray  # [3, 4] camera-to-world, axes as in `Cameras`
     lens: Lens
     beside: Path | None = None  # a mask that counts where the photograph has no alpha
-    moved: np.ndarray | None = None  # [3, 4] from the files' world to `pose`'s, as of `Photos`
+    moved: np.ndarray | None = None  # [3, 4] from the files' world to `pose`'s, as in `Photos`
 
 
 @dataclass(frozen=True)
@@ -337,7 +337,7 @@ def read_photo(
 
     Args:
         masks: False to look for none: alpha is 1 everywhere.
-        upright: as of `masks.laid_over`.
+        upright: as in `masks.laid_over`.
     """
     image = read_image(path, in_srgb=True)
     channels = image.shape[-1]

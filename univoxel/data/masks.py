@@ -306,7 +306,7 @@ def read_mask(
 
     Args:
         photograph: of this size, which EXIF may say to turn.
-        upright: as of `laid_over`.
+        upright: as in `laid_over`.
 
     Raises:
         DataError: it cannot be read, is none, or has another shape.

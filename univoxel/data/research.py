@@ -155,7 +155,7 @@ def decomposed(matrix: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
         matrix: [3, 4], of any scale and sign.
 
     Returns:
-        K with 1 at its end, and the pose, its axes as of `Cameras`.
+        K with 1 at its end, and the pose, its axes as in `Cameras`.
     """
     matrix = matrix * (1 if np.linalg.det(matrix[:, :3]) > 0 else -1)
     if not np.linalg.cond(matrix[:, :3]) < 1e12:

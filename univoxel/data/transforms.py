@@ -57,7 +57,7 @@ def load_cameras(
     Args:
         size: pixels, width and height of the pictures to come where the file gives no w and h,
             for all or with a frame.
-        moved: from the file's world to that of the cameras, as of `Photos`.
+        moved: from the file's world to that of the cameras, as in `Photos`.
 
     Returns:
         A name for each frame, from its file_path or its number, and the cameras.
@@ -201,7 +201,7 @@ def _folder(path: Path, frame: dict[str, Any], where: str) -> Path:
 
 
 def find_image(folder: Path, file_path: str, where: str) -> Path:
-    """The picture that a frame's file_path means, as of `listed_image`; a DataError without one."""
+    """The picture that a frame's file_path means, as in `listed_image`; a DataError without one."""
     found = listed_image(folder, file_path, where)
     if found is None:
         raise DataError(f"{where}: the image {folder / file_path} does not exist ({LOOKED_FOR})")
@@ -255,7 +255,7 @@ def _in_any_case(
 
 
 def _entries(folder: Path) -> dict[str, list[Path]]:
-    """What is in a folder, by its name as of `system.folded`."""
+    """What is in a folder, by its name as in `system.folded`."""
     entries: dict[str, list[Path]] = {}
     with suppress(OSError):
         for path in sorted(folder.iterdir()):

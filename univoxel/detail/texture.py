@@ -132,7 +132,7 @@ class Detail:
         Args:
             points, normals: [N, 3] world; unit.
             albedo: [N, 3] that the field has there.
-            footprint: as of `at`.
+            footprint: as in `at`.
         """
         out = albedo.clone()
         for some in torch.arange(len(points)).split(AT_ONCE):
@@ -335,7 +335,7 @@ class _Atlas:
     uv: Tensor  # [Q, 2]
     texel: Tensor  # [K] int32 those in charts, row * size + column
     face: Tensor  # [K] int32
-    barycentric: Tensor  # [K, 2] float16, as of `ops.Hit`
+    barycentric: Tensor  # [K, 2] float16, as in `ops.Hit`
 
 
 def _atlas(mesh: Mesh, size: int) -> _Atlas:
@@ -500,14 +500,14 @@ def save_detail(detail: Detail, run: Path) -> None:
 
 
 def albedo_near(run: str | Path) -> AlbedoNear | None:
-    """What gives the albedo of a run where it has detail; errors as of `load_detail`."""
+    """What gives the albedo of a run where it has detail; errors as in `load_detail`."""
     detail = load_detail(run)
     return None if detail is None else detail.near
 
 
 def page_options(run: str | Path) -> dict[str, Any]:
     """Fields of `univoxel.output.page.PageOptions` that show the detail of a run, if it has any;
-    errors as of `load_detail`."""
+    errors as in `load_detail`."""
     near = albedo_near(run)
     return {} if near is None else {"albedo_near": near, "texture_size": PAGE_SIZE}
 

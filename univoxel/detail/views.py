@@ -1,7 +1,7 @@
 """Novel views at any size: the model's light on the texture, and what it leaves of the photographs
 that were taken nearby; and how much of the photographs' own detail they show.
 
-A view is albedo * A + B, as of `univoxel.detail.texture`, with the texture for albedo. What the
+A view is albedo * A + B, as in `univoxel.detail.texture`, with the texture for albedo. What the
 model of light cannot say, such as how single fibres glitter, the nearest photographs do: each pixel
 is multiplied by (photo / prediction) of those, by how near their directions are. With
 no photograph near, that is 1.

@@ -483,7 +483,7 @@ def advise(
 
 
 def _shown(surveyed: Survey, surface: VisibilityScene, eye: Tensor) -> Tensor:
-    """Squared cosine [P] at which a camera sees points; 0 where it does not, as of `observe`."""
+    """Squared cosine [P] at which a camera sees points; 0 where it does not, as in `observe`."""
     towards = normalize(eye - surveyed.position, dim=1)
     cosine = (surveyed.normal * towards).sum(1)
     facing = (cosine > MIN_COSINE).nonzero()[:, 0]

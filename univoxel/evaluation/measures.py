@@ -145,7 +145,7 @@ def fit_light_(
     networks of light read.
 
     Args:
-        albedo_near: as of `render_layers`.
+        albedo_near: as in `render_layers`.
     """
     whole, wo = surface_of_view(scene, photos.cameras, view, albedo_near)
     color, alpha = photos.picture(view)
@@ -217,7 +217,7 @@ def expected_view(
     """The truth of one test view.
 
     Args:
-        relit: as of `SceneTruth`.
+        relit: as in `SceneTruth`.
         background: what the photograph is composited on.
 
     Raises:
@@ -402,7 +402,7 @@ def albedo_scales(scene: Scene, photos: Photos, albedo_near: AlbedoNear | None =
     This is a pass of its own, so that the pass that renders keeps one view in memory.
 
     Args:
-        albedo_near: as of `render_layers`.
+        albedo_near: as in `render_layers`.
     """
     pairs = []
     for view in range(len(photos)):

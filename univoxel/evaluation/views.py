@@ -80,7 +80,7 @@ def measure_views(
     Args:
         background: what novel views are compared with photographs on.
         fit_light: each is rendered in the light that fits its photograph.
-        albedo_near: as of `render_layers`.
+        albedo_near: as in `render_layers`.
     """
     doubts = Doubts(surveyed) if surveyed else None
     found = ViewMeasures({key: [] for key in MEASURES}, [], [])

@@ -118,7 +118,7 @@ def _composite(
 # A field composited along packed rays: sampling, opacity and compositing in one pass.
 
 
-# Lower and upper corner and voxel sizes of a hash table's levels, as of `encode_hash`
+# Lower and upper corner and voxel sizes of a hash table's levels, as in `encode_hash`
 Lattices: TypeAlias = "tuple[Sequence[float], Sequence[float], Sequence[float]]"
 RAY_NUMBERS = 5  # of a ray before its features: opacity, t, gradient
 SAMPLE_NUMBERS = 4  # of a held sample before its features: sdf, gradient
@@ -166,15 +166,15 @@ def composite_field(
 
     Args:
         sdf: [X, Y, Z] world units, negative inside; with bricks [R].
-        features: [X, Y, Z, C], with bricks [R, C]; with levels [L * rows, F] as of `encode_hash`,
+        features: [X, Y, Z, C], with bricks [R, C]; with levels [L * rows, F] as in `encode_hash`,
             and then C = L F.
         origin, direction: [N, 3] rays in the world.
-        samples: packed along them, as of `march`.
+        samples: packed along them, as in `march`.
         grid_origin: world position of node (0, 0, 0).
         voxel_size: world units, above 0.
         inv_s: 1 / s, sharpness of the density, 1 / world units, above 0.
         bricks: of a sparse grid.
-        levels: lower and upper corner and voxel sizes of a hash table, as of `encode_hash`.
+        levels: lower and upper corner and voxel sizes of a hash table, as in `encode_hash`.
         min_share: in [0, 1), of a ray's heaviest sample. Of samples with less only the distance is
             read: features and gradients are then the mean of the others, times the opacity.
         sparse_grad: gradients of sdf and features come back as coalesced ``sparse_coo`` tensors of

@@ -234,7 +234,7 @@ class Operator:
     ) -> None:
         """
         Args:
-            hints: types of the arguments and of what is returned, as of `hints_of`.
+            hints: types of the arguments and of what is returned, as in `hints_of`.
             fake: called as the kernel is; returns what comes out, without values.
         """
         qualified = f"univoxel::{name}"

@@ -39,7 +39,7 @@ def patch_correlation(
         brightness: [V, H, W] of all views, of any scale; below 0 where there is nothing to compare.
             H and W at least 2. Of the dtype of the others, or float16.
         projection: [V, 3, 4] world to (x z, y z, z), with x and y in pixels: 0.5 is the middle of
-            the first, as of `univoxel.camera.projection_matrices`.
+            the first, as in `univoxel.camera.projection_matrices`.
         origin: [N, 3] eye of the view that a patch is a square of pixels in.
         direction: [N, 3, 3] as above.
         own: [N, M] brightness of the pixels there, row by row; M the square of an odd number.

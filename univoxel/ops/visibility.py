@@ -104,7 +104,7 @@ class VisibilityScene:
         t_min: float = 0.0,
         t_max: float = float("inf"),
     ) -> Hit:
-        """The nearest triangle along each ray; arguments and errors as of `occluded`."""
+        """The nearest triangle along each ray; arguments and errors as in `occluded`."""
         _check_rays("closest_hit", origin, direction, t_min, t_max)
         scene = self.native()
         if scene is None:

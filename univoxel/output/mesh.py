@@ -51,7 +51,7 @@ class TexturedMesh:
     albedo: Tensor  # [T, T, 3] float32 linear, in [0, 1]; of a metal: its F0
     roughness: Tensor  # [T, T] float32 perceptual, in [0, 1]
     metallic: Tensor | None = None  # [T, T] float32 in [0, 1]; None: no metal anywhere
-    seen: Tensor | None = None  # [P] float32 in [0, 1], as of `Mesh`
+    seen: Tensor | None = None  # [P] float32 in [0, 1], as in `Mesh`
 
 
 def texture_pictures(mesh: TexturedMesh) -> dict[str, np.ndarray]:
@@ -367,7 +367,7 @@ def placement_of(
         size: the longest side of the box afterwards; None: as it is.
         origin: what comes to lie at 0: "upright" and "world", the data set's origin; "bottom", the
             middle of the box's floor; "centre", the middle of the box.
-        moved: how the data set's world was moved to the run's, as of `Photos`, which is undone.
+        moved: how the data set's world was moved to the run's, as in `Photos`, which is undone.
 
     Raises:
         UserError: the data set's origin is so far away that float32 cannot hold the vertices.

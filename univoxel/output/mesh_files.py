@@ -27,7 +27,7 @@ def write_glb(path: Path, mesh: TexturedMesh, jpeg: int | None = None) -> None:
     """Write a textured mesh as GLB, turned to +Y up, whole or not at all.
 
     Args:
-        jpeg: as of `glb`.
+        jpeg: as in `glb`.
 
     Raises:
         OSError: the file cannot be written; nothing is left behind.

@@ -144,7 +144,7 @@ def usual_lights() -> list[Light]:
 
 
 def light_of_file(path: Path) -> Light:
-    """A map from a file, averaged to at most MOST_ROWS rows; errors as of `read_map`."""
+    """A map from a file, averaged to at most MOST_ROWS rows; errors as in `read_map`."""
     radiance = read_map(path).radiance
     return Light(path.stem, _averaged(radiance, min(len(radiance), MOST_ROWS)))
 
@@ -301,7 +301,7 @@ def write_page(run: str | Path, path: str | Path, **options: Any) -> Path:
 def page_text(
     run: Path, scene: Scene, options: PageOptions = PageOptions(), seconds: float | None = None
 ) -> str:
-    """The page of a scene as HTML; errors as of `write_page`.
+    """The page of a scene as HTML; errors as in `write_page`.
 
     Args:
         run: the scene's folder; what is missing of log, trust report and photographs is left out.

@@ -144,7 +144,7 @@ def remarks(cfg: TrainConfig, state: dict[str, Any]) -> list[str]:
 
 
 FOLDER = Path(__file__).parent / "web"
-RING_GAP = 60.0  # degrees between neighbouring azimuths that are worth a word, as of `poses`
+RING_GAP = 60.0  # degrees between neighbouring azimuths that are worth a word, as in `poses`
 TRUTH = "This report uses no ground truth: it is computed from the photographs and the model."
 CHARTS = (
     "Stages minimise different sums, so the loss jumps between them. The validation PSNR is "
@@ -217,7 +217,7 @@ def write_report(run: str | Path, path: str | Path, **options: Any) -> Path:
 def report_text(
     run: Path, scene: Scene, state: dict[str, Any], options: ReportOptions = ReportOptions()
 ) -> str:
-    """The report of a scene as HTML; errors as of `write_report`.
+    """The report of a scene as HTML; errors as in `write_report`.
 
     Args:
         run: the scene's folder; what is missing of log, configuration and photographs is left out,

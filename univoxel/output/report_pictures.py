@@ -98,7 +98,7 @@ def worst(
 def compared(
     scene: Scene, split: Split, view: int, size: int, albedo_near: AlbedoNear | None = None
 ) -> Compared:
-    """One view, at most `size` pixels along its longer side; `albedo_near` as of `worst`."""
+    """One view, at most `size` pixels along its longer side; `albedo_near` as in `worst`."""
     photos = split.photos
     share = min(1.0, size / max(photos.cameras.size(view)))
     cameras = resize(photos.cameras, max(1, round(share * photos.cameras.width)))
@@ -139,7 +139,7 @@ def layers(
 
     Args:
         front: azimuth of the front, degrees from +X.
-        albedo_near: as of `worst`.
+        albedo_near: as in `worst`.
     """
     cameras = orbit(mesh, len(SIDES), size, ELEVATION, front)
     found: dict[str, list[Tensor]] = {}

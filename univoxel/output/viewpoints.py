@@ -80,7 +80,7 @@ def orbit(
 def views_of(
     run: Path, cameras: str | Path | Cameras, resolution: int | None, elevation: float, mesh: Mesh
 ) -> tuple[list[str], Cameras]:
-    """Names of the views, and their cameras; arguments as of `cli.relight.RelightOptions`.
+    """Names of the views, and their cameras; arguments as in `cli.relight.RelightOptions`.
 
     Raises:
         UserError: the cameras cannot be used.
@@ -161,7 +161,7 @@ class Studio:
 def open_studio(
     run: Path, cameras: str | Path | Cameras, resolution: int | None, elevation: float
 ) -> Studio:
-    """Load the scene and its mesh, and build the mesh's ray hierarchy; views as of `views_of`."""
+    """Load the scene and its mesh, and build the mesh's ray hierarchy; views as in `views_of`."""
     scene = load_scene(run)
     mesh = extract_mesh(scene)
     names, views = views_of(run, cameras, resolution, elevation, mesh)

@@ -84,7 +84,7 @@ class PinnedHull:
 
     position: Tensor  # [P, 3] world
     pinned: Tensor  # [P] bool
-    distance: Tensor  # of masks, as of `visual_hull`
+    distance: Tensor  # of masks, as in `visual_hull`
     cameras: Cameras
 
     def nodes(self, sdf: Tensor, grid: GridShape) -> Tensor:
@@ -123,7 +123,7 @@ def pinned_hull(
 
     Args:
         photos: in one light and exposure, their cameras where they are believed to be.
-        distance: of masks, as of `visual_hull`.
+        distance: of masks, as in `visual_hull`.
         hull: [X, Y, Z] sdf of the visual hull on the grid, world units.
     """
     seen = observe_hull(photos, hull, grid, POINTS)

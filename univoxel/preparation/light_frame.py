@@ -288,10 +288,10 @@ def explained_by_flash(observations: Observations, gains: Tensor | None = None) 
     the camera.
 
     Args:
-        gains: as of `light_frame_of`.
+        gains: as in `light_frame_of`.
     """
     log_color, point, view, normal, wo = comparable(observations, gains)
-    facing = (normal * wo).sum(1, keepdim=True)  # well above 0, as of `observe`
+    facing = (normal * wo).sum(1, keepdim=True)  # well above 0, as in `observe`
     away = (observations.eye[view] - observations.position[point]).norm(dim=1, keepdim=True)
     still = smooth(2 * facing * normal - wo)
     shade = facing.log() - 2 * (away / away.mean()).log()
@@ -316,7 +316,7 @@ def explained(
     Of photographs in two random halves, each is predicted by what was fitted to the other.
 
     Args:
-        gains: as of `light_frame_of`.
+        gains: as in `light_frame_of`.
     """
     log_color, point, view, normal, wo = comparable(observations, gains)
     facing = (normal * wo).sum(1, keepdim=True)

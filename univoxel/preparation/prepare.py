@@ -288,7 +288,7 @@ def prepare(
 
     Args:
         cfg: its first stage says how many voxels the hull's grid has.
-        begins: as of `find_silhouettes`.
+        begins: as in `find_silhouettes`.
     """
     stage = cfg.stages[0]
     assert isinstance(stage, StageConfig)

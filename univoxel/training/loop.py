@@ -263,8 +263,8 @@ def smoothness_losses(
     """Weighted priors: material and light change little from points to places beside them.
 
     Args:
-        view: [N] as of `shade`.
-        draw, features: as of `losses_of`.
+        view: [N] as in `shade`.
+        draw, features: as in `losses_of`.
     """
     away = scene.field.voxel_size * torch.randn(met.position.shape, generator=draw)
     beside = met.position.detach() + away

@@ -132,7 +132,7 @@ class Progress:
             begin: of reading the photographs, on the clock of `time.monotonic`.
             state: as `state` gave it; empty at the start of a run.
             on_progress: called with each report.
-            slower: as of `Clock`.
+            slower: as in `Clock`.
         """
         self.cfg: TrainConfig = cfg
         self.slower: float = slower

@@ -78,7 +78,7 @@ def mesh_of(scene: Scene, faces: int = FACES, cameras: Cameras | None = None) ->
     """The surface with at most so many triangles, materials and normals at its vertices.
 
     Args:
-        cameras: as of `surface_of`.
+        cameras: as in `surface_of`.
     """
     return with_materials(scene, simplify(surface_of(scene, cameras), faces))
 
