@@ -1,5 +1,5 @@
-"""Pinhole cameras, rays through their pixels, the circle that they stand on, and learned
-corrections of their poses."""
+"""Pinhole cameras, rays through their pixels, circles of cameras, and learned corrections of their
+poses."""
 
 from __future__ import annotations
 
@@ -240,7 +240,7 @@ def _through(chosen: Tensor, place: Tensor) -> Circle | None:
     return Circle(centre, axis, radius, torch.hypot(height, across - radius) / radius)
 
 
-# What the cameras of the photographs are off by, learned beside the scene.
+# Pose errors of the cameras, learned together with the scene.
 
 
 class PoseSteps(nn.Module):

@@ -1,4 +1,4 @@
-"""The whole configuration of a training run, and its file."""
+"""The complete configuration of a training, and its file."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ PREPARATION = 0.25
 
 @dataclass(frozen=True)
 class StageConfig:
-    """One stage of training, on a grid of its own resolution."""
+    """A stage of training at one grid resolution. Pairs are values at the start and the end."""
 
     voxels: float = field(
         metadata=about("most in the object's box; see voxel_pixels", unit="millions", above=0)
@@ -90,7 +90,7 @@ class StageConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of the losses; the photometric loss of the physically based render has 1."""
+    """Weights of the losses, relative to the photometric loss of the physically based render."""
 
     radiance: float = setting(1.0, "photometric loss of the radiance head's render", least=0)
     silhouette: float = setting(0.1, "difference between ray opacity and masks", least=0)
@@ -107,7 +107,7 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class MetalConfig:
-    """Which points are metal, see training/metals.py."""
+    """Metal classification, see training/metals.py."""
 
     min_reflectance: float = setting(
         0.25, "minimum of a metal's brightest channel; common ones have 0.4", least=0, most=1
@@ -118,7 +118,7 @@ class MetalConfig:
 
 @dataclass(frozen=True)
 class EntropyConfig:
-    """The prior that paint comes in few colours, see training/albedo_entropy.py."""
+    """The prior that an object has few albedo colours, see training/albedo_entropy.py."""
 
     teaching_steps: int = setting(
         60, "steps to learn new albedos after the environment map changed", least=1
@@ -129,7 +129,7 @@ class EntropyConfig:
 
 @dataclass(frozen=True)
 class JointConfig:
-    """The stage that solves for one map, the materials and normals, see training/joint_solve.py."""
+    """Joint optimisation of one environment map, materials and normals: training/joint_solve.py."""
 
     iterations: int = setting(675, "Adam steps in all rounds; fewer if time runs out", least=1)
     share: float = setting(0.27, "share of the time limit", above=0, most=1)
@@ -169,7 +169,7 @@ class JointConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """A training."""
+    """The complete configuration of a training."""
 
     data: Path = field(metadata=about("folder of the data set"))
     out: Path = field(metadata=about("folder of the run"))
@@ -268,9 +268,9 @@ def _is_utf8(path: Path) -> bool:
 
 
 def save_config(cfg: TrainConfig) -> None:
-    """Write the resolved configuration to config.json in the run's folder, whole or not at all.
+    """Write the resolved configuration to config.json in the run's folder, atomically.
 
-    The version of the package stands before it: constants that are no fields are those of it.
+    The version of the package comes first, because it determines all other constants.
 
     Raises:
         OSError: it cannot be written.
@@ -302,7 +302,7 @@ def load_config(path: Path) -> TrainConfig:
 
 
 def check_same(cfg: TrainConfig) -> None:
-    """Refuse to go on with the run in cfg.out under stages or a model that it did not begin with.
+    """Refuse to resume the run in cfg.out with other stages or another model.
 
     Raises:
         UserError: they differ, or config.json cannot be read.

@@ -192,7 +192,7 @@ def read_map(path: Path) -> EnvMap:
 
 
 def true_map(data: Path) -> Tensor | None:
-    """The light of the photographs, where the data set has it."""
+    """The true light of the photographs, if the data set has it."""
     for suffix in (".hdr", ".exr"):
         path = data / "envmaps" / f"train{suffix}"
         if path.is_file():

@@ -1,4 +1,4 @@
-"""The folder of a run: what data it was trained on, and whether it came out well."""
+"""The folder of a run: the data it was trained on, and the verdict on the result."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Source:
 
 
 def kept_photos(run: Path, split: str) -> Path:
-    """The file of a run that keeps photographs of a split as they were shrunk or straightened."""
+    """The file of a run that stores the prepared photographs of a split."""
     return run / f"photographs_{split}.safetensors"
 
 
@@ -36,10 +36,11 @@ def trained_on(run: Path) -> Path:
 
 
 def photos_of(run: Path, data: Path | None = None, split: str = "test") -> Photos:
-    """Photographs at the size that a run was trained at; of another data set, if one is given.
+    """Photographs at the size that a run was trained at.
 
     Args:
-        split: "test", or "train" for those that were trained on.
+        data: another data set; None: the one that the run was trained on.
+        split: "test" or "train".
 
     Raises:
         DataError: the run or the photographs cannot be read.
@@ -60,7 +61,7 @@ WORLD = "world.json"  # in the folder of a run whose world is not that of its da
 
 
 def save_world(moved: np.ndarray | None, run: Path) -> None:
-    """Write how the world of the data's files was moved to that of the run, as in `Photos`.
+    """Write the transform from the world of the data's files to that of the run, as in `Photos`.
 
     Raises:
         OSError: it cannot be written.
@@ -111,7 +112,7 @@ def _source_of(run: Path) -> Source:
     )
 
 
-# Whether a run came out well, by evidence: good, usable, retake or unfinished.
+# The verdict on a run, from evidence: good, usable, retake or unfinished.
 
 
 FILE = "verdict.json"  # in the folder of a run
@@ -129,7 +130,7 @@ GOOD_RESIDUAL, POOR_RESIDUAL = 0.15, 0.8
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a verdict rests on; None: not measured."""
+    """The evidence for a verdict; None: not measured."""
 
     steps: Mapping[str, float]  # share made, by name of the stages that were cut
     stopped: bool = False  # by hand
@@ -144,7 +145,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a run is worth, why, and what would help."""
+    """The quality of a run in a word, with reasons and remedies."""
 
     word: Word
     complete: bool  # whether all planned steps were made
@@ -154,7 +155,7 @@ class Verdict:
 
     @property
     def empty(self) -> bool:
-        """Whether a stage made no step at all: what it is for is missing."""
+        """Whether a stage made no step at all, so that its result is missing."""
         return any(made == 0 for made in self.evidence.steps.values())
 
     def lines(self) -> list[str]:
@@ -177,7 +178,7 @@ def judge(evidence: Evidence) -> Verdict:
     faults: list[tuple[bool, str, str]] = []  # whether it is poor, the reason, the remedy
 
     def check(value: float | None, good: float, poor: float, reason: str, remedy: str) -> None:
-        """Note a value that is not good; NaN is poor. Which way is better is told by the limits."""
+        """Note a value that is not good; NaN is poor. If good > poor, more is better."""
         if value is None:
             return
         sign = 1 if good > poor else -1
@@ -251,8 +252,7 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
 
 
 def load_verdict(run: Path) -> Verdict | None:
-    """The verdict on a run; None if there is none: it has not ended, or an older version trained
-    it."""
+    """The verdict on a run; None if training has not ended, or is older than version 0.3."""
     try:
         values = read_json(run / FILE)
         evidence = Evidence(**values["evidence"])

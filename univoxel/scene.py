@@ -1,4 +1,4 @@
-"""A scene: field, heads and light; its file, what that holds, and reading it back."""
+"""A scene: field, networks and light; writing it to a file and reading it back."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ class SceneConfig:
 
 
 class Scene(nn.Module):
-    """Everything that is learned of an object and of the light it stood in."""
+    """All that is learned about an object and its light."""
 
     def __init__(self, cfg: SceneConfig, field: Field, inv_s: float = 1.0) -> None:
         super().__init__()
@@ -143,10 +143,10 @@ class Scene(nn.Module):
         self._held = False
 
     def coded(self, features: Tensor, view: Tensor | int | None = None) -> Tensor:
-        """Features [N, C] as the networks of light read them: [N, C + Z], with the view's code.
+        """Append the view's appearance embedding to features [N, C]: [N, C + Z].
 
         Args:
-            view: [N] int64 number of a photograph, or one for all; None: the light that is shown.
+            view: [N] int64 index of a photograph, or one for all; None: the chosen light.
         """
         code = None if self.views is None else self.views.code(view)
         if code is None:
@@ -168,10 +168,10 @@ class Scene(nn.Module):
         return replace(photos, cameras=self.poses.corrected(photos.cameras))
 
     def show_light_of(self, view: str | None) -> None:
-        """Choose the photograph, by name or number, whose light is shown; None: the mean of all.
+        """Choose the photograph, by name or number, whose light is used; None: the mean of all.
 
         Raises:
-            ValueError: no such photograph, or the scene has one light for all.
+            ValueError: there is no such photograph, or the scene has one light for all.
         """
         if self.views is not None:
             self.views.choose(view)
@@ -219,7 +219,7 @@ class Scene(nn.Module):
         return self.__dict__ | {"_traced": None, "_held": False}
 
     def environment(self) -> DistantLight | lights.EnvmapLight | lights.EnvmapSGLight | None:
-        """The one distant map that the scene stood in, where it has one; without gains."""
+        """The environment map that is the same for all photographs, if there is one; no gains."""
         if isinstance(self.light, lights.EnvmapLight | lights.EnvmapSGLight):
             return self.light
         change = self.views.sky_change() if self.views else None
@@ -281,16 +281,16 @@ def stored(scene: Scene, slim: bool = False, reach: float | None = None) -> dict
 def save_scene(
     scene: Scene, run: Path, state: dict[str, Any], slim: bool = False, reach: float | None = None
 ) -> Path:
-    """Write run/scene.safetensors whole or not at all; `state` (JSON) travels in its metadata.
+    """Write run/scene.safetensors atomically; `state` (JSON) is stored in its metadata.
 
     Args:
-        slim: for a scene that is done: the grids in half precision, and features only where rays
-            meet the surface; otherwise what is loaded equals what was saved, bit by bit.
-        reach: voxels from the surface, > 0, beyond which a slim file says of a node only on which
-            side it lies; SHELL for features and no limit for distances when left out.
+        slim: for a finished scene: store the grids in half precision, and features only where rays
+            meet the surface. Otherwise, loading gives back the same bits.
+        reach: narrow-band width in voxels, > 0: beyond it a slim file stores only the sign of a
+            node's distance; None: SHELL for features and no limit for distances.
 
     Raises:
-        FileError: names the file when it cannot be written; the one before stays.
+        FileError: the file cannot be written; the earlier one is unchanged.
     """
     tensors = stored(scene, slim, reach)
     meta = {
@@ -382,13 +382,13 @@ class Description:
 
 
 def load_checkpoint(run: str | Path) -> tuple[Scene, dict[str, Any]]:
-    """The scene of a run, in evaluation mode, and the state it was saved with.
+    """The scene of a run, in evaluation mode, and the state that was saved with it.
 
-    Sizes that the file claims are compared with its tensors before memory is taken for them.
+    Sizes in the file are compared with its tensors before memory is allocated for them.
 
     Raises:
-        MissingFile: no checkpoint there.
-        DataError: one that is cut short, damaged, or of another version.
+        MissingFile: the run has no checkpoint.
+        DataError: the checkpoint is truncated, damaged or of another version.
     """
     path = Path(run) / FILE
     if not path.is_file():

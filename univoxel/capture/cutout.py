@@ -1,4 +1,4 @@
-"""Objects cut out of photographs without masks, and their masks to look through."""
+"""Masks for photographs whose cameras are known, and a page to check them."""
 
 from __future__ import annotations
 
@@ -159,27 +159,26 @@ def cutout(
     box: Sequence[float] | None = None,
     keep_table: bool = False,
 ) -> Path:
-    """Write the photographs of a data set with masks as their alpha, and their cameras; return out.
+    """Write the photographs of a data set with an alpha channel, and their cameras; return out.
 
-    All splits are written, in the layout of NeRF-synthetic scenes, without lens distortion, beside
-    masks.png and masks.html, which show the masks, worst first. The object is found from the
-    training photographs only.
+    All splits are written, in the layout of NeRF-synthetic scenes and without lens distortion.
+    masks.png and masks.html show the masks, worst first. The object is found from the training
+    photographs only.
 
     Args:
-        out: folder to write.
-        source: where masks come from: rembg, from a network; none, from depth only, of what
-            stands out from its support in the middle; else a folder of masks.
-        downscale: side of the squares of pixels that become one, 0 as in `load_photos`.
+        out: folder to write to.
+        source: source of the masks: rembg, a network; none, depth only, which finds the object
+            that stands on a table in the middle; else a folder of masks.
+        downscale: photographs are reduced to 1/N; 0: as in `load_photos`.
         allow_outside: as in `load_photos`.
-        network: which of rembg's networks makes them, if one does.
-        box: X0 Y0 Z0 X1 Y1 Z1, world units of the written cameras: what lies outside is not the
-            object.
-        keep_table: whether what stands out in depth keeps its support, within the box.
+        network: rembg's network to use.
+        box: X0 Y0 Z0 X1 Y1 Z1, a box around the object in the world of the written cameras.
+        keep_table: with masks from depth, keep the table inside the box.
 
     Raises:
-        DataError: photographs or masks that cannot be used, or nothing stands out in depth.
-        ExistingFile: out is there already.
-        MissingExtra: there is no network.
+        DataError: photographs or masks cannot be used, or depth separates no object.
+        ExistingFile: out exists already.
+        MissingExtra: the network is not installed.
         UserError: the masks have nothing in common, or arguments are inconsistent.
         OSError: a file cannot be written.
     """

@@ -67,27 +67,26 @@ def poses(
     keep_weak: bool = False,
     config: CaptureConfig = DEFAULTS,
 ) -> Path:
-    """Write photographs upright, with the cameras they were taken with, as a scene; return out.
+    """Find the camera poses of photographs and write both as a scene; return out.
 
-    The world has +Z up, its origin where the cameras look, and the median distance of cameras from
-    it is 4. An interrupted search continues with the same call.
+    Photographs are written upright. The world has +Z up, its origin is where the cameras look, and
+    their median distance from it is 4. After an interruption, call the function again to resume.
 
     Args:
-        photographs: a folder of photographs of any common format, or a video.
-        out: folder to write: images/, masks/, sparse/0 and poses.json, and sfm/ for the steps.
-        masks: folder of a mask for each photograph; features are sought within them only.
-        every: seconds of a video, of each of which the sharpest frame is taken.
-        keep_size: pixels of written photographs along the longer side, at most; 0 for any.
-        keep_weak: write photographs too whose cameras are not trusted.
+        photographs: a folder of photographs in any common format, or a video.
+        out: folder to write images/, masks/, sparse/0 and poses.json to, and sfm/ for the steps.
+        masks: folder with a mask for each photograph; features are detected inside them only.
+        every: seconds; the sharpest frame of a video in each such period is taken.
+        keep_size: maximum longer side of the written photographs, pixels; 0: any.
+        keep_weak: also write photographs with unreliable poses.
         config: how cameras are found.
 
     Raises:
-        MissingExtra: no pycolmap, or no reader of a format.
-        DataError: photographs that cannot be used, or too few that can be placed; as
-            StillBackground where an object was turned before a still camera, and there are no
-            masks.
+        MissingExtra: pycolmap or the reader of a format is missing.
+        DataError: photographs cannot be used, or too few can be registered. StillBackground: the
+            object was turned before a static camera, and there are no masks.
         ExistingFile: out holds something else.
-        ProcessFailed: a step did not end well.
+        ProcessFailed: a step failed.
         OSError: a file cannot be written.
     """
     source, out = Path(photographs), Path(out)

@@ -1,5 +1,5 @@
-"""What the photographs fix of a scene's materials, and what to photograph next: points of the
-surface, doubt anywhere, figures and words."""
+"""How well the photographs determine a scene's materials, and what to photograph next: points of
+the surface, uncertainty anywhere, figures and words."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Survey:
 
     @property
     def albedo(self) -> Tensor:
-        """Doubt of the albedo, in [0, 1]: 1 - seen * visibility * agreeing."""
+        """Uncertainty of the albedo, in [0, 1]: 1 - seen * visibility * agreeing."""
         seen = self.seen_with(self.straight)
         return torch.where(self.views > 0, 1 - seen * self.visibility * self.agreeing, 1.0)
 
@@ -94,10 +94,10 @@ class Survey:
 
     @property
     def roughness(self) -> Tensor:
-        """Doubt of the roughness, in [0, 1]: 1 - seen * visibility * agreeing * glossy.
+        """Uncertainty of the roughness, in [0, 1]: 1 - seen * visibility * agreeing * glossy.
 
-        glossy^2 is the share by which the photographs narrow what is known of roughness, its
-        variance, when before it could be anything in [0, 1].
+        glossy^2 is the share by which the photographs reduce the variance of the roughness, which
+        is uniform in [0, 1] before.
         """
         information = self.information
         return 1 - (1 - self.albedo) * (information / (1 + information)).sqrt()
@@ -111,7 +111,7 @@ class Survey:
 
 @torch.no_grad()
 def survey(scene: Scene, photos: Photos, points: int) -> Survey:
-    """What the photographs that were trained on fix of points of the surface.
+    """How well the training photographs determine points of the surface.
 
     Args:
         points: how many, >= 1, spread evenly.
@@ -261,7 +261,7 @@ NEIGHBOURS = 4
 
 
 class Doubts:
-    """Doubts of a survey, to be looked up anywhere on the surface."""
+    """Uncertainty of a survey, which can be looked up anywhere on the surface."""
 
     def __init__(self, surveyed: Survey) -> None:
         self._scale = NORMAL_SCALE * surveyed.voxel_size
@@ -320,7 +320,7 @@ def numbers(surveyed: Survey) -> dict[str, float]:
 
 
 def words(figures: dict[str, float], troubles: list[str]) -> str:
-    """The figures as a paragraph, without what is not the case.
+    """The figures as a paragraph; findings that do not apply are left out.
 
     Args:
         troubles: what went wrong in training, from its state.

@@ -1,4 +1,4 @@
-"""The measures of a trained scene against the truth of its test views, and pictures of them."""
+"""Metrics of a trained scene against the ground truth of its test views, and images of them."""
 
 from __future__ import annotations
 
@@ -283,7 +283,7 @@ def _check_size(photos: Photos, view: int, picture: Tensor, what: str) -> None:
         )
 
 
-# The measures of a trained scene, and what decides on them.
+# The metrics of a trained scene, and their definitions.
 #
 # - albedo_psnr_raw, _1ch, _3ch: albedo as it is; with one scale; with a scale per channel. -
 # albedo_psnr_fg: as _3ch, over the pixels of the mask only. - relit_psnr: rendered with the albedo
@@ -294,7 +294,7 @@ def _check_size(photos: Photos, view: int, picture: Tensor, what: str) -> None:
 # difference in sRGB; of the   roughness, absolute difference.
 
 
-# By key: what the table says of it
+# Description of each key in the table
 MEASURES = {
     "nvs_psnr": "novel views, PSNR, dB",
     "nvs_ssim": "novel views, SSIM",

@@ -1,5 +1,4 @@
-"""A run as one web page that needs no other file and no network: the object under lights that
-turn."""
+"""A run as one self-contained web page that shows the object under rotating lights."""
 
 from __future__ import annotations
 
@@ -276,7 +275,7 @@ SMALL = PageOptions(faces=8_000, texture_size=512)  # for a cell of a notebook
 
 
 def write_page(run: str | Path, path: str | Path, **options: Any) -> Path:
-    """Write a run as one page that opens by double click, without a network; return its path.
+    """Write a run as a self-contained web page; return its path.
 
     Args:
         run: folder of the trained run.

@@ -1,7 +1,7 @@
-"""A run as a report: one page without scripts and without network, which says how good the run is,
-where it is in doubt, and what to photograph next.
+"""A report on a run: one self-contained page, without scripts, with the quality of the run, its
+uncertainty, and what to photograph next.
 
-No truth is read.
+It uses no ground truth.
 """
 
 from __future__ import annotations
@@ -309,7 +309,7 @@ def next_section(advice: Advice) -> str:
 
 
 def doubt_section(known: Known, state: dict[str, Any], pictures: Sequence[Tensor]) -> str:
-    """What photographs leave open, in words and painted on the object."""
+    """The uncertainty, in words and painted on the object."""
     text = words(numbers(known.surveyed), list(state.get("troubles", [])))
     legend = "Uncertainty of the albedo: black is well determined, white is a guess."
     return paragraph(text) + gallery(zip(report_pictures.SIDES, pictures, strict=True), legend)
