@@ -59,7 +59,7 @@ def require() -> None:
     try:
         import matplotlib
     except ImportError:
-        raise MissingExtra("the pictures need matplotlib: pip install 'univoxel[chart]'") from None
+        raise MissingExtra("the images need matplotlib: pip install 'univoxel[chart]'") from None
     matplotlib.use("agg")
 
 

@@ -80,7 +80,7 @@ def submit(
         )
     run, out = Path(run), Path(out)
     if out.exists():
-        raise ExistingFile(f"{out} is there already: choose another out", "out")
+        raise ExistingFile(f"{out} exists already: choose another out", "out")
     photos = photos_of(run)
     folder, truth = scene_folders(photos.folder)
     scene, near = load_scene(run), albedo_near(run)
@@ -104,7 +104,7 @@ def scene_folders(folder: Path) -> tuple[Path, Path]:
     root = folder.parent.parent
     truth = root / "ground_truth" / folder.name
     if not truth.is_dir():
-        raise DataError(f"{folder}: expected a scene of Stanford-ORB with {truth}, got none there")
+        raise DataError(f"{folder}: expected a scene of Stanford-ORB with {truth}, found none")
     return root / "blender_HDR" / folder.name, truth
 
 

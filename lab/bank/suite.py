@@ -79,7 +79,7 @@ def bank(
         found = {folder: load_outcome(runs / folder.name / label) for folder in folders}
         outcomes = {folder: outcome for folder, outcome in found.items() if outcome is not None}
         if not outcomes:
-            raise UserError(f"{runs}: expected trainings named {label}, got none: train first")
+            raise UserError(f"{runs}: expected trainings named {label}, found none: train first")
     else:
         setting = Setting(label, preset, changes=tuple(changes))
         pairs = [(folder, setting) for folder in folders]

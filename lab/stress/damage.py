@@ -70,7 +70,7 @@ def damaged(
     photos = photos.of(torch.arange(damage.views))
     if damage.light:
         if second is None:
-            raise ValueError("damaged: light above 0 needs a scene in a second light")
+            raise ValueError("damaged: light above 0 needs a scene under a second light")
         share = torch.from_numpy(damage.light * random.uniform(size=damage.views)).float()
         other = load_photos(second, "train").color[: damage.views]
         photos = replace(photos, color=torch.lerp(photos.color, other, share[:, None, None, None]))

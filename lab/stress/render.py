@@ -128,7 +128,7 @@ def holds(identity: str, folder: Path) -> bool:
         return False
     if path.read_text(encoding="utf-8") != identity:
         raise UserError(
-            f"{path}: is of another scene: remove {folder}, or choose another out", "out"
+            f"{path}: made for another scene: remove {folder}, or choose another out", "out"
         )
     return True
 

@@ -140,10 +140,10 @@ def markdown(cells: Sequence[Cell]) -> str:
     axes, lights = _axes(cells), _lights(cells)
     made, said, found = plots.machine(), counts(cells), breaks(cells)
     lines = [
-        "# Where it breaks\n",
+        "# Breaking points\n",
         f"{said['trainings']} trainings on {made['threads']} threads of {made['processor']}: "
         f"{said['refused']} refused, {said['not finite']} not finite, {said['crashed']} crashed.\n",
-        f"Breaking point: where the relit PSNR has fallen {DROP:g} dB below the reference.\n",
+        f"Breaking point: the level at which the relit PSNR is {DROP:g} dB below the reference.\n",
         f"| axis | severities | {' | '.join(lights)} |",
         "|---|---|" + "---|" * len(lights),
     ]

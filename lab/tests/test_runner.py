@@ -164,10 +164,10 @@ def test_mistakes_are_found_before_anything_is_trained(data, tmp_path, trained):
     refused(ValueError, "expected at least one scene", [])
     refused(DataError, "transforms_test", [other])
     refused(
-        ValueError, r"settings of different names, got \['small', 'small'\]", [data], [SMALL] * 2
+        ValueError, r"settings with different names, got \['small', 'small'\]", [data], [SMALL] * 2
     )
     escaping = dataclasses.replace(SMALL, name="../up")
-    refused(ValueError, r"settings of different names, got \['../up'\]", settings=[escaping])
+    refused(ValueError, r"settings with different names, got \['../up'\]", settings=[escaping])
     refused(ValueError, "samples must be at least 1, got 0", samples=0)
     unknown = dataclasses.replace(SMALL, changes=("seed=x",))
     refused(ValueError, "changes=seed=x: expected a int", settings=[unknown])
@@ -183,7 +183,7 @@ def test_scenes_with_settings_of_their_own(data, tmp_path, trained):
     found = runner.run_pairs(pairs, tmp_path / "out", samples=1)
     assert [(o.scene, o.setting) for o in found] == [(d.name, s.name) for d, s in pairs]
     assert trained == ["small", "twice", "twice"]
-    with pytest.raises(ValueError, match="settings of different names, got"):
+    with pytest.raises(ValueError, match="settings with different names, got"):
         runner.run_pairs([(data, SMALL), (data, SMALL)], tmp_path / "out", samples=1)
 
 

@@ -1,6 +1,6 @@
-"""Names that pages take from the code: commands, options, imports, fields, constants, files.
+"""Names on pages that come from the code: commands, options, imports, fields, constants, files.
 
-A page that names what is not there is a fault, as a reader finds it too late.
+A name that does not exist is a fault.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ CODE = re.compile(r"```[\s\S]*?```|`[^`\n]+`|^    .*$", re.MULTILINE)
 FIELD = re.compile(r"\b([A-Z]\w*Config)\.(\w+)")
 CONSTANT = re.compile(r"(?<![\w/.-])[A-Z][A-Z_]{3,}(?![\w/.-])")
 FILE = re.compile(r"(?<![\w./])(?:univoxel/)?((?:\w+/)*\w+\.(?:py|cpp))\b")
+# Pages whose names of fields, constants and files are checked
+CHECKED = tuple(f"docs/{name}/" for name in ("tutorials", "guide", "method", "explanation"))
 # Options of every command
 COMMON = {"--help", "--quiet", "--verbose", "--threads", "--from"}
 # Placeholders of commands, and names that are not ours
@@ -41,7 +43,7 @@ def faults(root: Path) -> list[str]:
     for page in doc_blocks.pages(root):
         name, text = page.relative_to(root).as_posix(), page.read_text(encoding="utf-8")
         lines = [line for check in checks for line in check(text)]
-        if name.startswith(("docs/guide/", "docs/explanation/")):
+        if name.startswith(CHECKED):
             lines += [f"no such name: {fault}" for fault in unknown(root, text)]
         found += [f"{name}: {line}" for line in lines]
     return found
