@@ -1,4 +1,4 @@
-"""The sRGB transfer function and its slope: linear radiance inside, sRGB in pictures."""
+"""The sRGB transfer function and its slope: computations are linear, images are sRGB."""
 
 from __future__ import annotations
 

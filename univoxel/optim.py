@@ -1,4 +1,4 @@
-"""Adam that touches only the rows of a grid that got a gradient."""
+"""Adam that updates only the rows of a grid that received a gradient."""
 
 from __future__ import annotations
 

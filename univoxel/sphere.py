@@ -1,5 +1,5 @@
-"""Directions: point sets on the sphere, frames around a normal, the lat-long mapping, harmonics;
-and the sides of an object, in words."""
+"""Directions: point sets on the sphere, frames around a normal, lat-long mapping, harmonics; and
+names for the sides of an object."""
 
 from __future__ import annotations
 

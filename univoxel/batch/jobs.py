@@ -1,4 +1,4 @@
-"""Jobs: their steps as command lines, their records, and workers of Dask that run them."""
+"""Jobs: steps as command lines, their records, and the Dask workers that run them."""
 
 from __future__ import annotations
 

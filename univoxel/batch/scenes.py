@@ -1,4 +1,4 @@
-"""Many scenes as jobs: the steps of each, what came out of them, and a page of it."""
+"""Scenes as jobs: the steps of each, their results, and a web page of all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What may be chosen of finding cameras."""
+"""Settings of the search for cameras."""
 
 from __future__ import annotations
 

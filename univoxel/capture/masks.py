@@ -1,5 +1,4 @@
-"""Masks of many photographs: from a network, and which of them the object that all agree on
-contradicts."""
+"""Masks of many photographs from a network, and which of them contradict the object."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""COLMAP's files: its database of features and matches, and models with their points."""
+"""COLMAP's files: the database of features and matches, and models with their points."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Photographs of any format, and sharp frames of a video: which there are, what they say of
-their camera, their pixels upright."""
+"""Photographs of any format and sharp frames of a video: listing, metadata, upright pixels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether the poses that structure from motion found can be right, and why others are missing.
+"""Checks of the poses from structure from motion, and the reasons why others are missing.
 
 Structure from motion keeps the matches that fit and drops the others. Those dropped tell where it
 went wrong: of a photograph placed right, nearly all matches fit its place, however few there are.

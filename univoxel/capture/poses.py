@@ -1,4 +1,4 @@
-"""Find the cameras of photographs: from a folder of them, or a video, to a scene to train on."""
+"""Camera poses for a folder of photographs or a video, written as a scene to train on."""
 
 from __future__ import annotations
 

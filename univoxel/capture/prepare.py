@@ -1,4 +1,4 @@
-"""From files of any kind to the pictures, and masks, that structure from motion reads."""
+"""Prepares images and masks for structure from motion from files of any kind."""
 
 from __future__ import annotations
 

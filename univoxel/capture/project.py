@@ -1,4 +1,4 @@
-"""The folder of a capture: what it is made of, and where its parts lie."""
+"""The folder of a capture: its sources and its parts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Steps of structure from motion with pycolmap, each in a process of its own.
+"""Steps of structure from motion with pycolmap, each in its own process.
 
     python -m univoxel.capture.sfm REQUEST.json
 

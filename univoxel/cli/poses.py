@@ -1,4 +1,4 @@
-"""Find the cameras of photographs."""
+"""Find the camera poses of photographs."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Files that appear whole or not at all, JSON in files, and which steps of a task are done in a
-folder."""
+"""Atomic file writing, JSON files, and records of finished steps in a folder."""
 
 from __future__ import annotations
 

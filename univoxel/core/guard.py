@@ -1,4 +1,4 @@
-"""Processes of Python that end with the one that began them, and run its package.
+"""Child processes of Python that run the package and end with their parent.
 
 A process that is killed cannot end those that it began. They would continue alone, and write into
 files beside those that are begun again.

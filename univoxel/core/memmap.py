@@ -1,5 +1,4 @@
-"""Arrays of many photographs, in files where they are too large for memory, and work on them
-side by side."""
+"""Large arrays of photographs, in files if memory is too small, and parallel work on them."""
 
 from __future__ import annotations
 

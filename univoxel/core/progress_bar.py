@@ -1,4 +1,4 @@
-"""Progress for who asked for it: whose logger `univoxel` is enabled for INFO.
+"""Progress bars, shown if the logger `univoxel` is enabled for INFO.
 
 A bar on stderr where that is a terminal; elsewhere a line of the log now and then.
 """

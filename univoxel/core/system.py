@@ -1,4 +1,4 @@
-"""What Linux, macOS and Windows each do in another way: files, processes, what a machine has.
+"""Differences between Linux, macOS and Windows: files, processes, resources of the machine.
 
 Nothing else of the package asks which system it runs on. Where Linux says more, in its own files,
 `machine` reads that first.

@@ -1,5 +1,4 @@
-"""Checks of what configurations hold, fields that files of earlier versions hold still, and
-fields changed by their path."""
+"""Checks of configurations, fields in files of earlier versions, and changes of fields by path."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the layouts of other programs share: axes, names, numbers."""
+"""Conventions that layouts of other programs share: axes, names, numbers."""
 
 from __future__ import annotations
 

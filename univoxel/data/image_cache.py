@@ -1,4 +1,4 @@
-"""Photographs as training takes them, kept in a file: reading them again takes no time.
+"""Prepared photographs in a file, so that they need not be read again.
 
 Only what was shrunk or straightened is kept, and what is too large for memory; other photographs
 are read as fast from their files.

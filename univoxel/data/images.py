@@ -1,4 +1,4 @@
-"""Pictures in files: PNG, JPEG, OpenEXR and Radiance, read and written."""
+"""Image files: PNG, JPEG, OpenEXR and Radiance, reading and writing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lenses that bend straight lines, and the pinholes that their pictures are turned into."""
+"""Lens distortion, and the pinhole cameras of undistorted images."""
 
 from __future__ import annotations
 

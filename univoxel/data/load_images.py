@@ -1,4 +1,4 @@
-"""From posed files to `Photos`: what the loaders of all layouts share."""
+"""From posed image files to `Photos`: code that the loaders of all layouts share."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Masks in files of their own: whose each is, what its numbers mean, how it lies on pixels."""
+"""Mask files: the photograph, values and orientation of each."""
 
 from __future__ import annotations
 

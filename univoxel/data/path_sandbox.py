@@ -1,5 +1,4 @@
-"""Files that a data set names: whether they lie in its folder and are there, and arrays in those
-of NumPy."""
+"""Files that a data set names: they must exist inside its folder; and NumPy arrays in files."""
 
 from __future__ import annotations
 

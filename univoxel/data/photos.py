@@ -1,4 +1,4 @@
-"""What every loader returns."""
+"""The records that every loader returns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Layouts that research publishes its scenes in: LLFF, IDR, NeILF, TensoIR."""
+"""Layouts of published research data sets: LLFF, IDR, NeILF, TensoIR."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Cameras in the JSON of NeRF: what its layouts share, NeRF-synthetic's and nerfstudio's, and
-camera paths without pictures."""
+"""Cameras in NeRF's JSON: common parts, NeRF-synthetic, nerfstudio, and camera paths without
+images."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Ground truth beside the photographs: materials, normals, relit views, points and meshes of the
-surface."""
+"""Ground truth of a data set: materials, normals, relit views, points and meshes of the surface."""
 
 from __future__ import annotations
 

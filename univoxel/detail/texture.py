@@ -1,4 +1,4 @@
-"""Albedo from the photographs at their own size, on the mesh of a trained scene.
+"""Albedo from full-size photographs, on the mesh of a trained scene.
 
 Training looks at photographs that were shrunk, through a grid that is coarser still. Its surface,
 cameras, light and roughness are good enough to take the light out of the photographs as they are:

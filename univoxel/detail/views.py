@@ -1,5 +1,5 @@
-"""Novel views at any size: the model's light on the texture, and what it leaves of the photographs
-that were taken nearby; and how much of the photographs' own detail they show.
+"""Novel views at any size: the texture under the model's light, plus residuals of photographs
+nearby; and the share of the photographs' detail that they show.
 
 A view is albedo * A + B, as in `univoxel.detail.texture`, with the texture for albedo. What the
 model of light cannot say, such as how single fibres glitter, the nearest photographs do: each pixel

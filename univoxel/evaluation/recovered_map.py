@@ -1,4 +1,4 @@
-"""The environment map that a scene recovered, and how far it is from the true one."""
+"""The recovered environment map of a scene, and its difference from the true one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Test views as a scene renders them against their truth: measures, pictures, and what is weak."""
+"""Test views of a scene against their ground truth: metrics, images, uncertainty."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""What every grid of signed distances offers, the dense one, and how a finished scene stores
-them."""
+"""Grids of signed distances: the common interface, the dense grid, and compact storage."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""A field: signed distances and features everywhere in a box, and the small networks that decode
-them."""
+"""A field: signed distances and features inside a box, and the small networks that decode them."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The interface of all lights, what is likely of them, and what those share that vary over the
-surface."""
+"""The interface of all lighting models, their regularisation, and a base for local light."""
 
 from __future__ import annotations
 

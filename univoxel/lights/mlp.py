@@ -1,4 +1,4 @@
-"""Light as a network of place and direction."""
+"""Local light as a network of position and direction."""
 
 from __future__ import annotations
 

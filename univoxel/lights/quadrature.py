@@ -1,4 +1,4 @@
-"""Reflection of any light, by quadrature over the half-sphere or the sphere."""
+"""Reflection of any light by quadrature over the hemisphere or the sphere."""
 
 from __future__ import annotations
 

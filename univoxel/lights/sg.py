@@ -1,4 +1,4 @@
-"""Light as spherical Gaussians that vary over the surface."""
+"""Local light as spherical Gaussians."""
 
 from __future__ import annotations
 

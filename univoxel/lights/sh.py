@@ -1,4 +1,4 @@
-"""Light as spherical harmonics that vary over the surface."""
+"""Local light as spherical harmonics."""
 
 from __future__ import annotations
 

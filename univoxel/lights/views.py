@@ -1,5 +1,4 @@
-"""What the light of each photograph has of its own: a gain, a flash, or where the whole light
-turns with the camera."""
+"""Light that depends on the photograph: a gain, a flash, or light that turns with the camera."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Volume rendering of packed rays: opacity from signed distances, compositing, and a field
-sampled and composited in one pass."""
+"""Volume rendering of packed rays: opacity from signed distances, compositing, and a fused op that
+samples and composites a field."""
 
 from __future__ import annotations
 

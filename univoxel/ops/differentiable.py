@@ -1,5 +1,4 @@
-"""Ops with gradients, declared once and registered with torch in full, and one check for the
-arguments of every op."""
+"""Declaration of ops with gradients and their registration with torch; checks of arguments."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Sampling of dense grids, and of grids of which only bricks around a surface are stored:
-distance, its spatial gradient and features at points."""
+"""Sampling of dense grids, and of sparse grids stored in bricks: distance, its spatial gradient and
+features at points."""
 
 from __future__ import annotations
 

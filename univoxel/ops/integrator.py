@@ -1,4 +1,4 @@
-"""Light that points of a surface send to the eye under an environment map, by path tracing."""
+"""Radiance that surface points send to the eye under an environment map, by path tracing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Marching rays through an SDF grid: where along each ray is there something to see."""
+"""Ray marching through an SDF grid: finds the samples with visible density."""
 
 from __future__ import annotations
 

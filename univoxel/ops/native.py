@@ -1,4 +1,4 @@
-"""The door to the compiled kernels: which build is loaded, when it serves, on how many threads.
+"""Loading of the compiled kernels: which build is used, for which tensors, on how many threads.
 
 Nothing outside ``univoxel.ops`` imports the extension.
 """

@@ -1,4 +1,4 @@
-"""Small networks: the op, and the modules that decode what was composited along a ray."""
+"""Small networks: the op, and modules that decode features composited along a ray."""
 
 from __future__ import annotations
 

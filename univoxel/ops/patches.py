@@ -1,5 +1,4 @@
-"""Photographs compared: patches of a surface correlated between them, and depth from how well
-pixels agree along rays."""
+"""Comparison of photographs: correlation of surface patches, and stereo matching along rays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Some rows of a table: one step of Adam in place, and sums of their gradients."""
+"""Rows of a table: an Adam step in place, and sums of their gradients."""
 
 from __future__ import annotations
 

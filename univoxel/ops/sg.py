@@ -1,5 +1,4 @@
-"""Spherical Gaussians: lobes from numbers without limits, and shading under them by quadrature
-over the half-sphere."""
+"""Spherical Gaussians: decoding of lobes, and shading by quadrature over the hemisphere."""
 
 from __future__ import annotations
 

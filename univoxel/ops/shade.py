@@ -1,5 +1,5 @@
-"""Shading under light that is given on fixed directions of the sphere, and each direction's part
-in it."""
+"""Shading under light given for fixed directions of the sphere, and the response to each
+direction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Smoothing of grids where an optimiser step touches them, and of what it is about to add."""
+"""Smoothing of the grid rows that an optimiser step updates, and of their gradients."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rays against a triangle mesh: what lies between a point and the light."""
+"""Ray tracing against a triangle mesh: occlusion between a point and the light."""
 
 from __future__ import annotations
 

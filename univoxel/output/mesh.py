@@ -1,5 +1,5 @@
-"""Textured meshes: the record that writers share, its texture atlas, how a scene's field is read
-into it, and where it lies."""
+"""Textured meshes: the record that writers share, the texture atlas, baking of a scene's field, and
+placement."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of a report: photographs beside renders, four sides, the light, drawings."""
+"""Images of a report: photographs beside renders, four sides, the light, diagrams."""
 
 from __future__ import annotations
 

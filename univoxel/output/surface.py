@@ -1,5 +1,4 @@
-"""The surface of a scene as a clean, closed mesh: what photographs saw stays, what none saw is
-smooth."""
+"""The surface of a scene as a clean, closed mesh; parts that no photograph shows are smoothed."""
 
 from __future__ import annotations
 

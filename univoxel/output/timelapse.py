@@ -1,4 +1,4 @@
-"""Moving pictures: GIF or MP4, and one view of a scene while it is trained."""
+"""Animations as GIF or MP4, and a view of a scene during training."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which triangles an exported mesh keeps: cleaning, closing and decimation.
+"""Clean-up, closing and decimation of exported meshes.
 
 Functions take and give the geometry only, and what is seen of it where that is known; what else a
 mesh carries at its vertices is dropped.

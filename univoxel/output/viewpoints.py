@@ -1,4 +1,4 @@
-"""Cameras of relit frames, test views, an orbit, a path from a file; and the frames they make."""
+"""Cameras of relit frames (test views, an orbit, a path from a file) and the frames."""
 
 from __future__ import annotations
 

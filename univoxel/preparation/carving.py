@@ -1,5 +1,4 @@
-"""Space carving of concavities that no silhouette shows, by depths of a plane sweep below the
-visual hull."""
+"""Space carving of concavities that no silhouette shows, with depths from a plane sweep."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Where the object can be: bounds and a first SDF from silhouettes, and what photographs show of
-its points."""
+"""The visual hull: bounds and a first SDF from silhouettes, and colours of its points."""
 
 from __future__ import annotations
 

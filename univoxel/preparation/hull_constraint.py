@@ -1,4 +1,4 @@
-"""Where the visual hull is right because it explains what mirrors.
+"""Parts of the visual hull that are kept because they explain reflections.
 
 What a mirror shows lies behind it for all photographs, so colours pull its surface there, and bend
 it. Yet silhouettes give the shape of most polished things to a fraction of a voxel. Whether they do

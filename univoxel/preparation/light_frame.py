@@ -1,4 +1,4 @@
-"""What the light stood still in: the world, the room of a turntable, or, as a flash, the camera.
+"""The frame that the light is fixed to: the world, the room of a turntable, or the camera.
 
 Of a turntable also a background that stood still, and cameras off the circle of the others.
 """

@@ -1,4 +1,4 @@
-"""Whether masks end where the object does: there pictures change more than beside it."""
+"""Detects masks that extend past the object, where images change most beside the mask's edge."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The object told in 3D: what masks and depth maps of all photographs say of each place, gaps
-that few see through included."""
+"""The shape of the object from the masks and depth maps of all photographs."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Cameras against silhouettes: whether they are inconsistent, which of cameras and masks
-are believed, and how to put cameras right."""
+"""Silhouette-based pose refinement, and the choice between wrong cameras and wrong masks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What masks, cameras and photographs say before the first gradient, in order."""
+"""The preparation of masks, cameras and photographs, in order."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Masks that are inconsistent, held against the object that photographs and masks agree on.
+"""Correction of inconsistent masks with the shape that photographs and masks agree on.
 
 Where a mask and the object's silhouette differ by more than a jagged edge, nothing is known: the
 pixel tells neither of the object nor of emptiness. A part that was moved between photographs, such

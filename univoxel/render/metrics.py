@@ -1,4 +1,4 @@
-"""How good a reconstruction is, and what training minimises: plain functions of tensors."""
+"""Quality metrics and losses: plain functions of tensors."""
 
 from __future__ import annotations
 

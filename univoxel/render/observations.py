@@ -1,5 +1,4 @@
-"""Points of the surface: what sees them, what they see, and what photographs and one map make of
-them."""
+"""Surface points with their observations in photographs, and their shading under one map."""
 
 from __future__ import annotations
 

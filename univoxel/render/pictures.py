@@ -1,5 +1,4 @@
-"""Pictures put together: contact sheets, spheres under a map, photographs made small, a scene's
-present state."""
+"""Composed images: contact sheets, spheres under a map, thumbnails, previews of a scene."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""A surface under new light: paths until the noise is low, shadows on a floor, and the whole
-picture put together."""
+"""Relighting of a surface: path tracing to a noise level, shadows on a floor, compositing."""
 
 from __future__ import annotations
 

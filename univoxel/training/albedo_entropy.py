@@ -1,4 +1,4 @@
-"""The light under which a surface has the fewest colours.
+"""The light under which the albedo has the lowest entropy.
 
 A diffuse point under one light shows its albedo times its irradiance, and neither alone. Under a
 map that is brighter above than it was, or that lacks a sun, shades and shadows become paint. But

@@ -1,4 +1,4 @@
-"""Steps of a training against its time."""
+"""The schedule of training steps under a time limit."""
 
 from __future__ import annotations
 

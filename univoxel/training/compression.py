@@ -1,5 +1,4 @@
-"""What makes a scene as small as it may be: what is chosen, when, what it costs, and what its
-file stores."""
+"""Compression of a scene: the choice of sizes, their cost in quality, and compact storage."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""How every stage descends: gradients of a surface smoothed, steps dropped whose numbers fail,
-an end where validation pixels improve no more."""
+"""The optimiser of every stage: smoothed gradients, recovery from failed steps, early stopping."""
 
 from __future__ import annotations
 

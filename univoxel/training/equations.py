@@ -1,4 +1,4 @@
-"""Gauss-Newton on the light of photographs: the normal equations that newton.py solves."""
+"""Normal equations of Gauss-Newton on the environment map, which newton.py solves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One environment map, albedo and roughness from the photographs, with traced visibility.
+"""Joint optimisation of one environment map, albedo and roughness, with traced visibility.
 
 Local lobes explain every photograph and leave shadows in the albedo. Once geometry stands, the
 light is known to be one distant map that reaches a point where nothing is in the way, and what is

@@ -1,4 +1,4 @@
-"""The training loop, and what it minimises."""
+"""The training loop and its losses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which points of the surface are metal, and where the joint optimisation starts from."""
+"""Metal classification of surface points, and the initialisation of the joint optimisation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Metals that mirror their surroundings, found by how much they change from view to view."""
+"""Detection of metals that reflect their surroundings sharply, by changes between views."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which pixels of the photographs training looks at, and the memory that it will need."""
+"""The pixels that training uses, and the memory that it needs."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""What a training tells of itself: bar, log, messages, the state that it is saved with, and what
-compression chose."""
+"""Progress of a training: bar, log, messages, saved state, and choices of compression."""
 
 from __future__ import annotations
 

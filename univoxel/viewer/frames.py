@@ -1,5 +1,4 @@
-"""Pictures of a subject: a quick one while something moves, better and better ones at rest,
-noise taken out."""
+"""Frames of the viewer: fast during motion, refined and denoised at rest."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Who gets the next picture: one thread renders for all clients, those who move first; and turns
-around the object."""
+"""The render thread, which serves moving clients first; and orbits around the object."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run in browsers: viser's page around our pictures. Each client has a view and light of its own.
+"""The viewer's server, built on viser. Each client has its own view and light.
 
 viser draws the controls and moves the camera; the picture stands behind its empty scene.
 """

@@ -1,4 +1,4 @@
-"""A training in browsers, as it goes, and the server that pages of one machine see."""
+"""A training in the browser while it runs, and the server with its access rules."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""What a viewer shows: the scene, its mesh with materials, what photographs say of it, and the
-light at a point."""
+"""The contents of the viewer: scene, mesh with materials, photographs, and the light at a point."""
 
 from __future__ import annotations
 
