@@ -95,7 +95,7 @@ def composite(
 def composite_reference(
     alpha: Tensor, value: Tensor, offsets: Tensor, early_stop: float = 0.0
 ) -> tuple[Tensor, Tensor]:
-    """The same in eager torch: rays padded to the longest, autograd gives the backward."""
+    """Reference in eager PyTorch: rays padded to the longest, autograd gives the backward."""
     counts = offsets.diff()
     ray = torch.repeat_interleave(counts)
     slot = torch.arange(len(alpha), device=alpha.device) - offsets[ray]
@@ -148,7 +148,7 @@ def composite_field(
     min_share: float = 0.0,
     sparse_grad: bool = False,
 ) -> FieldAlongRays:
-    """Sample a field along packed rays and composite what it says, front to back.
+    """Sample a field along packed rays and composite it, front to back.
 
     At the samples x_i = origin + t_i direction of a ray, the field has distances f_i, gradients and
     features as `sample_dense` (with bricks `sample_sparse`) and `encode_hash` define them. From i
@@ -283,7 +283,7 @@ def composite_field_reference(
     levels: Lattices | None = None,
     min_share: float = 0.0,
 ) -> Tensor:
-    """The same in eager torch, op by op: opacity, t, gradient and features, [N, 5 + C]."""
+    """Reference in eager PyTorch, op by op: opacity, t, gradient and features, [N, 5 + C]."""
     ray = torch.repeat_interleave(samples.offsets.diff())
     points = origin[ray] + samples.t[:, None] * direction[ray]
     of_nodes = features if levels is None else sdf.new_empty(*sdf.shape, 0)

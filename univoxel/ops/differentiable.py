@@ -25,7 +25,7 @@ def check(
     of the same dtype as the other floating ones. All share one device.
 
     Raises:
-        TypeError: an argument is no tensor.
+        TypeError: an argument is not a tensor.
         ValueError: a size, dtype or device is off; the message says what was wanted and what came.
     """
     sizes: dict[str, int] = {}

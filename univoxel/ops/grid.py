@@ -222,7 +222,7 @@ def sample_dense(
 def sample_dense_reference(
     sdf: Tensor, features: Tensor, points: Tensor, origin: Sequence[float], voxel_size: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The same in eager torch: eight corners, each with its six neighbours."""
+    """Reference in eager PyTorch: eight corners, each with its six neighbours."""
     size = torch.tensor(sdf.shape, device=sdf.device)
     lost = points.isnan().any(1, keepdim=True)
     start = torch.tensor(origin, dtype=torch.float64, device=sdf.device)
@@ -281,7 +281,7 @@ def sample_sparse(
         value [M], world units; gradient [M, 3], no unit; feature [M, C].
 
     Raises:
-        TypeError, ValueError: an argument is no tensor or no Bricks, or of another size, dtype or
+        TypeError, ValueError: an argument is not a tensor or Bricks, or has another size, dtype or
             device than above; the grid has no nodes; origin or voxel_size out of range.
 
     Differentiable in: sdf, features, points. Second order raises.
@@ -318,7 +318,7 @@ def sample_sparse_reference(
     origin: Sequence[float],
     voxel_size: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The same in eager torch, over the whole grid."""
+    """Reference in eager PyTorch, over the whole grid."""
     rows = bricks.grid_rows()
     stored = rows >= Bricks.MISSING * Bricks.NODES
     whole = torch.where(stored, sdf[rows], sdf.detach()[rows])

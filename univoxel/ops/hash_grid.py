@@ -119,7 +119,7 @@ def encode_hash_reference(
     voxel_sizes: Sequence[float],
     felt: int | None = None,
 ) -> Tensor:
-    """The same in eager torch: level by level, corner by corner."""
+    """Reference in eager PyTorch: level by level, corner by corner."""
     rows = len(table) // len(voxel_sizes)
     lost = points.isnan().any(1, keepdim=True)
     points = torch.where(lost, 0.0, points)

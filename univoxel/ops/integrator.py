@@ -40,7 +40,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Sun:
-    """A disc of even light far away.
+    """A distant disc of uniform light.
 
     Raises:
         ValueError: a number is not finite, the direction has no length, the irradiance is below 0,
@@ -61,7 +61,7 @@ class Sun:
 
 @dataclass(frozen=True)
 class PointLight:
-    """A point that shines evenly all around; irradiance falls with the distance squared.
+    """A point that emits uniformly; irradiance falls with the squared distance.
 
     Raises:
         ValueError: a number is not finite, or the intensity is below 0.
@@ -97,7 +97,7 @@ def relight(
     seed: int = 0,
     strategy: Strategy = "mis",
 ) -> Tensor:
-    """Radiance that surface points send along wo under an environment map and other lights.
+    """Path-traced radiance of surface points along wo, under an environment map and other lights.
 
         L(wo) = integral over the half-sphere of f(wi, wo) L_i(wi) (n.wi) dwi
 

@@ -52,9 +52,9 @@ class NativeStatus:
 
 
 def native_status() -> NativeStatus:
-    """Return what is known of the compiled extension: whether it serves, and if not, why.
+    """The status of the compiled extension: whether it is loaded, and if not, why.
 
-    Without it, ops run in eager torch, and `VisibilityScene` is refused.
+    Without it, ops run in eager PyTorch, and `VisibilityScene` raises.
     """
     version = core.embree_version() if core is not None else 0
     return NativeStatus(
@@ -141,7 +141,7 @@ def reference_asked() -> bool:
 
 @contextlib.contextmanager
 def use_backend(name: Backend) -> Iterator[None]:
-    """Force a side within a ``with`` block: "native", "reference", or "auto" (the default).
+    """Force a backend within a ``with`` block: "native", "reference", or "auto" (the default).
 
     Raises:
         ValueError: an unknown name.

@@ -54,7 +54,7 @@ def mlp(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tenso
 
 
 def mlp_reference(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
-    """The same in eager torch."""
+    """Reference in eager PyTorch."""
     for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
         x = torch.relu(torch.nn.functional.linear(x, weight, bias))
     return torch.nn.functional.linear(x, weights[-1], biases[-1])

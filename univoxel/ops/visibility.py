@@ -22,7 +22,7 @@ class Hit:
 
 
 class VisibilityScene:
-    """A triangle mesh ready for rays: an Embree hierarchy, built once.
+    """A triangle mesh for ray tracing: an Embree hierarchy, built once.
 
     Args:
         vertices: [P, 3] float32, world; on the CPU.
