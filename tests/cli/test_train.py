@@ -200,7 +200,9 @@ def test_a_model_of_colmap_in_a_world_of_its_own(tmp_path, caplog):
     data = write_colmap(tmp_path / "data", written, parameters=(focal, 32.0, 32.0))
     stages = (plain_stage(voxels=0.01, iterations=40, share=1.0, rays=256),)
     out = train(config(data, tmp_path / "run", stages=stages, downscale=2))
-    said = "COLMAP model, 14 photographs of 32x32 pixels in train, shrunk to 1/2, world turned to"
+    said = (
+        "COLMAP model, 14 photographs of 32x32 pixels in train, downscaled to 1/2, world turned to"
+    )
     assert said in caplog.text
     mesh = extract_mesh(load_scene(out))
     middle = (mesh.vertices.amin(0) + mesh.vertices.amax(0)) / 2

@@ -63,7 +63,7 @@ LOCAL, CENTRAL = b"PK\x03\x04", b"PK\x01\x02"
 def test_broken_npz(tmp_path, content):
     path = tmp_path / "a.npz"
     path.write_bytes(content)
-    with pytest.raises(DataError, match=r"a\.npz: expected an npz file, could not read it"):
+    with pytest.raises(DataError, match=r"a\.npz: this npz file could not be read"):
         read_npz(path)
 
 

@@ -78,10 +78,10 @@ SENSOR = '<sensor id="3" label="unknown" type="frame">'
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (edited(("</chunk>", "")), "cameras.xml: expected XML, could not read it: mismatched tag"),
+        (edited(("</chunk>", "")), "cameras.xml: this XML could not be read: mismatched tag"),
         (
             edited(("<document", '<!DOCTYPE d [<!ENTITY a "b">]><document')),
-            "cameras.xml: expected XML of Metashape, got one with definitions of its own",
+            "cameras.xml: expected Metashape XML, got XML with its own",
         ),
         (
             edited(("<chunk", "<x><chunk"), ("</chunk>", "</chunk></x>")),
@@ -94,11 +94,11 @@ SENSOR = '<sensor id="3" label="unknown" type="frame">'
         (edited(("<f>11.0</f>", "")), "sensor 3 of p_000: expected a number as f, got nothing"),
         (edited(("<f>11.0", "<f>wide")), "sensor 3 of p_000: expected a number as f, got 'wide'"),
         (edited(("<f>11.0", "<f>-11.0")), "sensor 3 of p_000: expected fl_x between 0 and inf"),
-        (edited(("<f>11.0", "<p3>.1</p3><f>11.0")), "expected distortion by k1 to k4, p1 and p2"),
+        (edited(("<f>11.0", "<p3>.1</p3><f>11.0")), "expected distortion k1 to k4, p1 and p2"),
         (edited(("<f>11.0", "<b2>2</b2><f>11.0")), "p_000: expected pixels with perp"),
         (edited(('width="12"', 'width="0"')), "sensor 3 of p_000: expected a resolution above 0,"),
         (edited(('width="12"', "")), "sensor 3 of p_000: expected a number as width, got nothing"),
-        (edited(('width="12"', 'width="9"')), r"p_000.png: expected a picture of the shape 9x8"),
+        (edited(('width="12"', 'width="9"')), r"p_000.png: expected an image with the shape 9x8"),
         (edited(("<scale>2.5", "<scale>-2.5")), "transform of component 0: expected a scale"),
         (edited(("<scale>2.5", "<scale>2.5 1")), "transform of component 0: expected 1 numbers"),
         (edited(("<rotation>", "<rotation>1 ")), "transform of component 0: expected 9 numbers"),
@@ -106,7 +106,10 @@ SENSOR = '<sensor id="3" label="unknown" type="frame">'
             edited(('label="p_000"><transform>', 'label="p_000"><transform>1 ')),
             "camera p_000: expected 16 numbers as transform",
         ),
-        (lambda f: (f / "images").rename(f / "photos"), "cameras.xml: no picture p_000, p_001,"),
+        (
+            lambda f: (f / "images").rename(f / "photos"),
+            "cameras.xml: missing images: p_000, p_001,",
+        ),
     ],
 )
 def test_one_line_for_what_is_broken(tmp_path, damage, message):

@@ -100,7 +100,7 @@ def test_relit_views(tmp_path):
 
 def test_broken_relit_views(tmp_path):
     (tmp_path / "relight" / "city").mkdir(parents=True)
-    with pytest.raises(DataError, match=r"city: expected its map .*city\.hdr, got nothing there"):
+    with pytest.raises(DataError, match=r"city: expected its environment map .*city\.hdr, but"):
         relight_maps(tmp_path)
     with pytest.raises(DataError, match=r"relight/city: no picture .*r_0"):
         load_relit(photos(tmp_path), "city")
@@ -210,7 +210,7 @@ def test_truth_is_shrunk_by_coverage(tmp_path):
     ("file", "picture", "message"),
     [
         ("albedo", gray(1, width=5), "expected 6x4 pixels as in the photograph, got 5x4"),
-        ("normal", gray(1)[..., 0], "expected a picture with 3 or 4 channels, got 1"),
+        ("normal", gray(1)[..., 0], "expected an image with 3 or 4 channels, got 1"),
     ],
 )
 def test_broken_pictures_of_truth(tmp_path, file, picture, message):

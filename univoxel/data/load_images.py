@@ -221,7 +221,7 @@ def _read_all(
         turned = sum(orientation(image) != 1 for image, _ in pairs)
         log.info(
             "%d photographs have an EXIF orientation: their masks seem to be made for %s",
-            *(turned, "the stored pixels" if upright else "the upright image"),
+            *(turned, "the upright image" if upright else "the stored pixels"),
         )
     reading = Reading.resumed(origin)
     begin = reading.read if reading else 0
