@@ -179,9 +179,7 @@ def test_names_of_colmap_out_of_the_folder(tmp_path):
     (data / "images" / "p_004.png").rename(tmp_path / "p_004.png")
     path = data / "sparse/0/images.txt"
     path.write_text(path.read_text().replace("p_004.png", "../../p_004.png"))
-    with pytest.raises(
-        DataError, match=r"images\.txt: expected files inside .*data, got .*p_004\.png"
-    ):
+    with pytest.raises(DataError, match=r"images\.txt: expected files inside .*data, .*p_004\.png"):
         load_photos(data)
 
 
@@ -200,9 +198,7 @@ def test_cameras_that_are_a_link_out_of_the_folder(tmp_path, layout):
     for number, path in enumerate(described):
         path.rename(elsewhere / f"{number}{path.suffix}")
         path.symlink_to(elsewhere / f"{number}{path.suffix}")
-    with pytest.raises(
-        DataError, match=r"expected files inside .*data, got .*elsewhere.*allow_out"
-    ):
+    with pytest.raises(DataError, match=r"expected files inside .*data, got .*elsewhere.*allow"):
         load_photos(data)
     assert len(load_photos(data, allow_outside=True)) == 8
 

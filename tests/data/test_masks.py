@@ -355,9 +355,7 @@ def test_masks_of_pictures_that_were_mirrored_or_turned(lit, way, word):
     assert load_photos(lit).alpha.any()
     for path in (lit / "masks").iterdir():
         save(path, way(np.asarray(Image.open(path))))
-    with pytest.raises(
-        DataError, match=f"8 of 8 sampled masks fit their photographs only when {word}"
-    ):
+    with pytest.raises(DataError, match=f"8 of 8 sampled masks fit .* only when {word}"):
         load_photos(lit)
 
 

@@ -106,10 +106,7 @@ SENSOR = '<sensor id="3" label="unknown" type="frame">'
             edited(('label="p_000"><transform>', 'label="p_000"><transform>1 ')),
             "camera p_000: expected 16 numbers as transform",
         ),
-        (
-            lambda f: (f / "images").rename(f / "photos"),
-            "cameras.xml: missing images: p_000, p_001,",
-        ),
+        (lambda f: (f / "images").rename(f / "photos"), "cameras.xml: missing images: p_000"),
     ],
 )
 def test_one_line_for_what_is_broken(tmp_path, damage, message):
