@@ -1,4 +1,4 @@
-"""Draw the results of benchmarks/ops.py, from the file alone: PNG and SVG beside it.
+"""Draw the results of benchmarks/ops.py, from the file only: PNG and SVG beside it.
 
 python benchmarks/charts.py [RESULTS.json ...]
 """

@@ -7,7 +7,7 @@ training without heads: march, sample, composite, backward, gradient spread, Ada
 look at the bricks every 16 steps. Every case is a process of its own; memory is the most that it
 held resident, less what it held before the field was made. Exponents are slopes of log cost over
 log size, of the four largest sizes. Dense grids stop where memory does (--most, in GB). A picture
-stands beside the JSON where matplotlib is there.
+is beside the JSON where matplotlib is there.
 """
 
 from __future__ import annotations

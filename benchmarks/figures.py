@@ -3,7 +3,7 @@
     python benchmarks/figures.py DATA [--only NAME ...] [--work build/figures] [--list]
 
 DATA holds the scenes sneaker, tea_table and chrome_bottle, and real/ with captures. What is of this
-version is not made again, and what was interrupted goes on, so the same command may be given as
+version is not made again, and what was interrupted continues, so the same command may be given as
 often as it takes. Times are measured: nothing else should run. Then `scripts/docs --write` puts the
 figures into the pages. The folders in results/ are experiments, each of the version that it was
 made with.
@@ -141,7 +141,7 @@ def make(figure: Figure, places: dict[str, Path]) -> None:
 
 
 def version_of(name: str) -> str | None:
-    """The commit that a figure is of; None where there is none yet."""
+    """The commit that a figure is of; None if there is none yet."""
     path = RESULTS / f"{name}.json"
     return json.loads(path.read_text(encoding="utf-8"))["commit"] if path.is_file() else None
 

@@ -6,7 +6,7 @@ smooth: the weight of the smoothness of the local lobes, on every scene. white: 
 weight of the prior for white light, on the first scene as it is and under light of another colour
 (its photographs times COLOR; the true albedo stays). Scenes are brought to about --pixels wide.
 What differs in a weight alone shares the first stage, which no light takes part in. What is done
-already is not done again; the chart is drawn anew from all there is.
+already is not done again; the chart is drawn again from all there is.
 """
 
 from __future__ import annotations

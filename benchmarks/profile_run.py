@@ -63,7 +63,7 @@ PARTS = {
 
 
 class RunClock(Clock):
-    """A clock for a whole training: it starts anew with every stage."""
+    """A clock for a whole training: it starts again with every stage."""
 
     def __init__(self, cfg: TrainConfig, now: Callable[[], float]) -> None:
         super().__init__(now)
@@ -86,7 +86,7 @@ class RunClock(Clock):
         return call
 
     def enter(self, title: str) -> None:
-        """Book what was measured to a column and start anew."""
+        """Book what was measured to a column and start again."""
         whole = self.now() - self.begin
         rows = defaultdict(float, self.forward)
         divided = sum(self.backward.values())

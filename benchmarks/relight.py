@@ -153,7 +153,7 @@ def _llvm() -> dict[str, str]:
 
 
 def _seconds(stderr: str) -> float:
-    """Time of rendering alone, which the script reports after warming up."""
+    """Time of rendering only, which the script reports after warming up."""
     return float(stderr.rpartition("seconds ")[2].split()[0])
 
 

@@ -1,6 +1,6 @@
 """Shadow rays of relight.py: their rate within the integrator, and of bare Embree on the same rays.
 
-The integrator is run with the map's samples alone and without bounces: then all its rays are shadow
+The integrator is run with the map's samples only and without bounces: then all its rays are shadow
 rays. Its rate is the number of rays over all its time: numbers drawn, directions, BRDF, lookups of
 the map, tracing and sums. Rays that it leaves out, as they would carry no light, count for none.
 

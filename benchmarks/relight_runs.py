@@ -3,7 +3,7 @@
 python benchmarks/relight_runs.py OUT.json RUN [RUN ...] [--every N]
 
 PSNR is relit_psnr of `univoxel eval`: test views under the data set's other maps, the albedo times
-a scale per channel. The time of a frame is that of the pixels' light alone; its error is the root
+a scale per channel. The time of a frame is that of the pixels' light only; its error is the root
 mean square over the object, in steps of 1 / 255 of sRGB, against 4096 samples.
 """
 

@@ -6,7 +6,7 @@
 
 Six objects of lab/bank on six supports, rendered by Mitsuba: 40 photographs of 1600 x 1200 pixels
 from all around, as JPEG files with the EXIF of a phone, with noise, and exposures up to half a stop
-apart. The border cuts the object in a third of them. --render makes them alone; a photograph that
+apart. The border cuts the object in a third of them. --render makes them only; a photograph that
 is there is not made again. Mitsuba wants LLVM 16 or later: DRJIT_LIBLLVM_PATH says where it is.
 
 `capture` makes a `draft` of each room, with masks from --masks. Beside it a `draft` is trained on
@@ -188,7 +188,7 @@ def half_of(room: Room) -> np.ndarray:
 
 
 def furniture(room: Room, floor: float, width: int) -> Part:
-    """Walls, floor, support and what else stands in the room.
+    """Walls, floor, support and what else is in the room.
 
     Args:
         floor: its z; the support's top is `room.height` above it.
@@ -359,7 +359,7 @@ def smoothed(picture: np.ndarray, inside: np.ndarray) -> np.ndarray:
     """Linear colour [H, W, 3] with less noise: light is smoothed, and what it shines on is not.
 
     Args:
-        picture: as of `pictured`.
+        picture: as in `pictured`.
         inside: [H, W] the object's silhouette, across which nothing is smoothed.
     """
     shown, colour = despeckled(picture[..., :4])[..., :3], picture[..., 4:] + 0.02
@@ -526,7 +526,7 @@ def relit(
 
 
 def row_of(room: Room, folder: Path, width: int, masks: str) -> list[object]:
-    """A value for each of COLUMNS; None where capture failed."""
+    """A value for each of COLUMNS; None if capture failed."""
     points = torch.from_numpy(np.load(folder / "truth" / "points.npz")["points"])
     best = folder / "best"
     if not (best / "trust.txt").exists():

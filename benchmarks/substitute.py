@@ -116,7 +116,7 @@ def at_nodes(radiance: Tensor, sky: DistantLight) -> Tensor:
 def begin(folder: Path, out: Path, name: str, term: str) -> TrainConfig:
     """A run that begins with the truth in place of a term, and stays with it."""
     cfg = preset(name, folder, out)
-    cfg = replace(cfg, minutes=60.0)  # by steps alone: other work must not change the result
+    cfg = replace(cfg, minutes=60.0)  # by steps only: other work must not change the result
     photos = load_photos(folder, "train")
     distance = mask_distances(photos.coverage())
     lower, upper = estimate_bounds(distance, photos.cameras)
@@ -185,7 +185,7 @@ def relit_with_true_pixels(run: Path, folder: Path, samples: int = 64) -> dict[s
 
 
 def of_truth(surface: Surface, truth, cameras, view: int) -> dict[str, Tensor]:
-    """The true fields of a view's pixels, and the surface's own where there is no truth."""
+    """The true fields of a view's pixels, and the surface's own if there is no truth."""
     there = truth.mask.reshape(-1) & (surface.opacity > 0.5)
     rays = image_rays(cameras, view)
     along = -(rays.direction @ cameras.camera_to_world[view, :, 2])

@@ -6,7 +6,7 @@ Makes data sets of one, in --work:
 - exposure: a random gain per view within +-1 stop; metered: as a camera's automatic would set it,
   towards the same mean brightness in every view, within +-1 stop;
 - color: random gains per view and channel within +-1/2 stop;
-- relit: the photographs rendered anew by univoxel's own path tracer, under the training map, from
+- relit: the photographs rendered again by univoxel's own path tracer, under the training map, from
   the data set's mesh with the albedo and roughness of the nearest pixels of its test views;
 - turned: the same, with the map turning with the camera about +Z, as on a turntable.
 Test views and all ground truth stay as they are. Then trains each kind without and with --varying
@@ -140,7 +140,7 @@ def rendered(folder: Path, photos: Photos, degrees: torch.Tensor) -> torch.Tenso
         rgb = relight_surface(surface, wo, here, rotated(light, float(degrees[v])), **options)
         picture, there = torch.zeros(len(met), 3), met.view(photos.alpha.shape[1:]).numpy()
         picture[met] = linear_to_srgb(rgb)
-        # Where a pixel's middle misses the mesh, the nearest one that does not stands in
+        # Where a pixel's middle misses the mesh, the nearest one that does not is in
         _, nearest = ndimage.distance_transform_edt(~there, return_indices=True)
         row, column = (torch.from_numpy(n) for n in nearest)
         out[v] = (255 * picture.view(*there.shape, 3)[row, column]).round().to(torch.uint8)
@@ -182,7 +182,7 @@ def make(folder: Path, kind: str, out: Path) -> Path:
 
 
 def gain_error(run: Path, folder: Path, kind: str) -> float | None:
-    """Root mean square error of the recovered gains, in stops; None where the run has none."""
+    """Root mean square error of the recovered gains, in stops; None if the run has none."""
     views = load_scene(run).views
     if views is None or KINDS[kind][0] != "fixed":
         return None

@@ -28,7 +28,7 @@ class Published:
 
     name: str
     where: str  # data and machine
-    minutes: float | None  # of training; None where none is published
+    minutes: float | None  # of training; None if none is published
     measures: dict[str, float]
 
 
@@ -61,18 +61,18 @@ def chart(
     jobs: int = 1,
     scheduler: str | None = None,
 ) -> Path:
-    """Train every scene with presets and knobs; write out/chart.json, .png and .svg.
+    """Train every scene with presets and variants; write out/chart.json, .png and .svg.
 
     Args:
-        scenes: folders of data sets, of different names.
-        out: every training is kept in out/SCENE/SETTING, and not done again by a later call.
-        preset: what the knobs are turned around.
-        light: of the presets and the knobs.
-        quick: draft, the preset and three knobs.
-        only: names of settings; all when empty.
-        changes: FIELD=VALUE of the configuration, for all.
-        samples: of the light per pixel of relit pictures in evaluation.
-        jobs, scheduler: trainings at once here, or who else trains; as of runner.run_pairs.
+        scenes: folders of data sets with different names.
+        out: folder that keeps every training in SCENE/SETTING; later calls reuse them.
+        preset: preset to vary.
+        light: lighting model.
+        quick: draft, the preset and three variants.
+        only: names of settings; empty: all.
+        changes: FIELD=VALUE of the configuration, for all trainings.
+        samples: light samples per pixel of relit images.
+        jobs, scheduler: trainings at once, or a Dask scheduler; see runner.run_pairs.
 
     Returns:
         out/chart.png.
@@ -138,8 +138,8 @@ def fronts(outcomes: Sequence[Outcome]) -> dict[str, dict[str, list[str]]]:
 
 
 def plot(outcomes: Sequence[Outcome], stem: Path) -> list[Path]:
-    """For each scene a panel for each measure that there is, and one of the held-out rays while
-    training went on."""
+    """For each scene a panel for each measure that there is, and one of the validation pixels while
+    training continued."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogFormatter
 
@@ -155,7 +155,7 @@ def plot(outcomes: Sequence[Outcome], stem: Path) -> list[Path]:
             axis.set_title(f"{scene}: {measure.title}", size=10)
         log, *unused = row[len(shown) :]
         _draw_logs(log, [o for o in outcomes if o.scene == scene and not o.error])
-        log.set_title(f"{scene}: held-out rays of training views, dB", size=10)
+        log.set_title(f"{scene}: validation PSNR of training views, dB", size=10)
         for axis in (*row[: len(shown)], log):
             axis.set_xscale("log")
             axis.xaxis.set_major_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))
@@ -177,7 +177,7 @@ def plot(outcomes: Sequence[Outcome], stem: Path) -> list[Path]:
 
 
 def _marks(outcomes: Sequence[Outcome]) -> dict[str, str]:
-    """What stands beside a setting's dots: a preset's name, a number for others."""
+    """What is beside a setting's dots: a preset's name, a number for others."""
     names = list(dict.fromkeys(o.setting for o in outcomes))
     others = [name for name in names if name not in PRESETS]
     return {name: name if name in PRESETS else str(others.index(name) + 1) for name in names}

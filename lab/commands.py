@@ -1,4 +1,4 @@
-"""Commands of the laboratory: `univoxel lab compare`, `chart`, `stress`, `bank`, `submit`."""
+"""Commands for experiments: `univoxel lab compare`, `chart`, `stress`, `bank`, `submit`."""
 
 from __future__ import annotations
 
@@ -28,16 +28,15 @@ def submit(
     samples: Annotated[int, written("N")] = SAMPLES,
     bounces: Annotated[int, written("N")] = BOUNCES,
 ) -> None:
-    """Write what the benchmark of Stanford-ORB measures, of a run.
+    """Write the files that the Stanford-ORB benchmark measures.
 
-    The run was trained on a scene of it.
+    The run must have been trained on a scene of the benchmark.
 
     Args:
         run: folder of a trained run
-        out: folder to write; its submission.json lists the files, as scripts/test.py of the
-            benchmark reads it
-        samples: light samples per pixel of relit pictures
-        bounces: reflections between parts of the object in relit pictures, 0 for none
+        out: folder to write to; the benchmark's scripts/test.py reads its submission.json
+        samples: light samples per pixel of relit images
+        bounces: light bounces between parts of the object in relit images
     """
     from lab import submit as task
 
@@ -56,24 +55,23 @@ def compare(
     jobs: AtOnce = 1,
     scheduler: Scheduler = None,
 ) -> None:
-    """Train scenes with every model of light, side by side.
+    """Train scenes with every lighting model, side by side.
 
-    Writes DIR/compare.md, compare.json, compare.png and compare.svg. Every training is kept in
-    DIR/SCENE/LIGHT with all its measures (result.json); the same command again goes on after an
-    interruption and tries again what failed. Trainings run one after another, each in a process of
-    its own: leave the machine to them, or their times say little.
+    Writes DIR/compare.md, compare.json, compare.png and compare.svg. DIR/SCENE/LIGHT keeps each
+    training with its metrics (result.json): run the same command again to resume, or to retry
+    failed trainings. Trainings run one after another, each in its own process. Run nothing else
+    meanwhile, because that would distort the times.
 
     Args:
         scenes: folders of photographs
-        out: folder for the results
-        preset: how much work goes into each training, as of train
-        light: models of light, as of train --light; sg:lobes=12 changes a field of the light's
-            configuration, sg:lobes=12,hidden=32 two
-        minutes: wall-clock limit of each training, above 0
-        samples: of the light, per pixel of relit pictures
-        set: one field of the configuration of all trainings, as of train
-        jobs: trainings at once; with more than one, their times say little
-        scheduler: of a Dask cluster whose workers train, as of batch
+        out: folder to write to
+        preset: amount of work, from draft to best
+        light: lighting models; sg:lobes=12,hidden=32 also changes two fields
+        minutes: time limit of each training
+        samples: light samples per pixel of relit images
+        set: change one configuration field of all trainings; repeatable
+        jobs: trainings at once; more than one distorts the times
+        scheduler: Dask scheduler to use; anyone who can reach it can run code on its workers
     """
     from lab import compare as experiment
 
@@ -95,26 +93,26 @@ def chart(
     jobs: AtOnce = 1,
     scheduler: Scheduler = None,
 ) -> None:
-    """Draw quality against training time, of presets and knobs.
+    """Draw quality against training time, for presets and variants.
 
-    Trains draft, fast, full, best, and --preset with one knob turned: voxels-x0.5 (half the voxels
-    of the finest grid), voxels-x2, rays-x0.5 (half the rays of a step), rays-x2, steps-,
-    directions- and lobes- alike, light-sg and so on. Writes DIR/chart.png, chart.svg and chart.json
-    with every measure, the log of each training, and the Pareto front of each measure: settings
-    that no other beats in both time and quality. Published figures, of other data and of GPUs, are
-    marked. Trainings are kept, and gone on with, as of compare.
+    Trains draft, fast, full and best, and variants of --preset that change one setting:
+    voxels-x0.5 (half the voxels of the finest grid), voxels-x2, rays-x0.5 (half the rays per step),
+    rays-x2, the same for steps, directions and lobes, light-sg and so on. Writes DIR/chart.png,
+    chart.svg and chart.json with every metric, the log of each training, and the Pareto front of
+    each metric. Published figures are marked; they come from other data and from GPUs. Finished
+    trainings are kept: run the same command again to resume.
 
     Args:
         scenes: folders of photographs
-        out: folder for the results
-        preset: what the knobs are turned around
-        light: of the presets and the knobs
+        out: folder to write to
+        preset: preset to vary
+        light: lighting model of all settings but light-NAME
         quick: five settings instead of all
-        only: names of settings
-        samples: of the light, per pixel of relit pictures
-        set: one field of the configuration of all trainings, as of train
-        jobs: trainings at once; with more than one, their times say little
-        scheduler: of a Dask cluster whose workers train, as of batch
+        only: names of the settings to train
+        samples: light samples per pixel of relit images
+        set: change one configuration field of all trainings; repeatable
+        jobs: trainings at once; more than one distorts the times
+        scheduler: Dask scheduler to use; anyone who can reach it can run code on its workers
     """
     from lab import chart as experiment
 
@@ -135,24 +133,25 @@ def stress(
     jobs: AtOnce = 1,
     scheduler: Scheduler = None,
 ) -> None:
-    """Find out where the method breaks, on scenes of known truth.
+    """Find the limits of the method, on scenes with ground truth.
 
-    Renders small scenes with Mitsuba 3, made harder along one axis each, spoils their photographs,
-    trains and measures. Writes DIR/stress.md with the breaking point of each axis, stress.json,
-    stress.png and stress.svg.
+    Renders small scenes with Mitsuba 3, each harder along one axis or with degraded photographs,
+    then trains and measures. Writes DIR/stress.md with the breaking point of each axis,
+    stress.json, stress.png and stress.svg.
     Axes: roughness, metal, concavity, sun, views, pose, exposure, light, masks, rough-masks, thin,
     fur, turntable, noise, placement, dark, bright; light-varying is trained with --varying light.
-    A training that fails is a result. What is done is kept: the same command goes on.
+    A failed training counts as a result. Finished trainings are kept: run the same command again to
+    resume.
 
     Args:
         out: folder for scenes, photographs, trainings and results
-        quick: fewer severities of each axis
-        only: names of axes
-        light: models of light, as of train
-        seeds: trainings of each level, with other random numbers
-        set: one field of the configuration of all trainings, as of train
-        jobs: trainings at once; with more than one, their times say little
-        scheduler: of a Dask cluster whose workers train, as of batch
+        quick: fewer levels of each axis
+        only: names of the axes to run
+        light: lighting models
+        seeds: trainings per level, with different random seeds
+        set: change one configuration field of all trainings; repeatable
+        jobs: trainings at once; more than one distorts the times
+        scheduler: Dask scheduler to use; anyone who can reach it can run code on its workers
     """
     from lab.stress import suite
 
@@ -172,23 +171,24 @@ def bank(
     set: Changes = (),
     jobs: AtOnce = 1,
 ) -> None:
-    """Measure decisions, on random scenes of known truth.
+    """Measure quality and decisions on random scenes.
 
-    Renders random objects, materials, light and captures with Mitsuba 3, trains on each, and says
-    how good results are in the mean, which share of decisions is right, and whether doubt foretells
-    errors. Half of the scenes are to tune with, half to judge with; the seed says which, for good.
-    Writes DIR/seed-N/judge-NAME.md and .json. What is done is kept: the same command goes on.
+    Renders random objects, materials, light and captures with Mitsuba 3 and trains on each. Reports
+    the mean quality, the share of correct decisions, and whether uncertainty predicts errors. One
+    half of the scenes is for tuning and the other for judging; the seed determines which. Writes
+    DIR/seed-N/judge-NAME.md and .json. Finished trainings are kept: run the same command again to
+    resume.
 
     Args:
         out: folder for scenes and trainings
-        render: only render what is missing
-        judge: only print what trainings so far say
-        half: of the scenes; both when left out
-        scenes: how many, of both halves together
-        seed: of the scenes
-        label: of the trainings, to keep those of several versions apart
-        preset: how much work goes into each training, as of train
-        set: one field of the configuration of all trainings, as of train
+        render: only render the missing scenes
+        judge: only print the results of finished trainings
+        half: half of the scenes to use; both if omitted
+        scenes: number of scenes in both halves together
+        seed: random seed of the scenes
+        label: name of the trainings, to keep those of several versions apart
+        preset: amount of work, from draft to best
+        set: change one configuration field of all trainings; repeatable
         jobs: trainings at once
     """
     from lab.bank import suite

@@ -43,13 +43,13 @@ def compare(
     """Train every scene with every light; write out/compare.md, .json, .png and .svg.
 
     Args:
-        scenes: folders of data sets, of different names.
-        out: every training is kept in out/SCENE/LIGHT, and not done again by a later call.
-        light: names as of --light; `NAME:FIELD=VALUE[,FIELD=VALUE]` changes fields of the light.
-        preset, minutes: how much work goes into each, as of presets.chosen.
-        changes: FIELD=VALUE of the configuration, for all.
-        samples: of the light per pixel of relit pictures in evaluation.
-        jobs, scheduler: trainings at once here, or who else trains; as of runner.run_pairs.
+        scenes: folders of data sets with different names.
+        out: folder that keeps every training in SCENE/LIGHT; later calls reuse them.
+        light: names, as for --light; `NAME:FIELD=VALUE[,FIELD=VALUE]` changes fields of the light.
+        preset, minutes: amount of work; see presets.chosen.
+        changes: FIELD=VALUE of the configuration, for all trainings.
+        samples: light samples per pixel of relit images.
+        jobs, scheduler: trainings at once, or a Dask scheduler; see runner.run_pairs.
 
     Returns:
         out/compare.md.

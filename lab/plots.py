@@ -38,7 +38,7 @@ ALBEDO_1CH = Measure("albedo_psnr_1ch", "albedo, one scale, dB", True)
 ROUGHNESS = Measure("roughness_mse", "roughness MSE", False, ".4f")
 RELIT = Measure("relit_psnr", "relit, dB", True)
 NORMAL = Measure("normal_mae_deg", "normals, degrees", False)
-MAP = Measure("map_ball_psnr", "grey ball under the map, dB", True)
+MAP = Measure("map_ball_psnr", "diffuse sphere under the map, dB", True)
 SECONDS = Measure("train_seconds", "training, s", False, ".0f")
 STEPS = Measure("steps_made", "steps made", True, ".0%")
 MEMORY = Measure("peak_rss_mb", "peak memory, MB", False, ".0f")
@@ -59,7 +59,7 @@ def require() -> None:
     try:
         import matplotlib
     except ImportError:
-        raise MissingExtra("the pictures need matplotlib: pip install 'univoxel[chart]'") from None
+        raise MissingExtra("the images need matplotlib: pip install 'univoxel[chart]'") from None
     matplotlib.use("agg")
 
 

@@ -27,7 +27,7 @@ class Setting:
     name: str  # of its folder and in tables; unique among the settings of an experiment
     preset: str = "auto"
     light: LightName = "hybrid"
-    minutes: float | None = None  # as of presets.chosen
+    minutes: float | None = None  # as in presets.chosen
     changes: tuple[str, ...] = ()  # FIELD=VALUE of the configuration
 
     def config(self, data: Path, out: Path) -> TrainConfig:
@@ -90,7 +90,7 @@ def _is_measures(values: object) -> bool:
 
 
 def load_outcome(folder: Path) -> Outcome | None:
-    """What folder/result.json holds; None where there is none.
+    """What folder/result.json holds; None if there is none.
 
     Raises:
         ValueError: it is no such file.

@@ -32,7 +32,7 @@ def run(
 
     Raises:
         DataError: a scene cannot be read.
-        UserError: two scenes or settings of one name; as of `run_pairs`.
+        UserError: two scenes or settings of one name; as in `run_pairs`.
         OSError: `out` cannot be written.
     """
     settings = _distinct(settings)
@@ -57,7 +57,7 @@ def run_pairs(
 
     out/SCENE/SETTING/ holds the run, what it said (job.txt) and result.json, an `Outcome`. A
     training whose result.json is there already is not done again; one that failed is. A failure is
-    an outcome like others, that of a scene that cannot be read too: the rest goes on.
+    an outcome like others, that of a scene that cannot be read too: the rest continues.
 
     Args:
         pairs: scenes are told apart by the names of their folders.
@@ -85,8 +85,8 @@ def _run(jobs: Sequence[Job], at_once: int, scheduler: str | None) -> list[Outco
         found = load_outcome(job.files.parent)
         if found is not None and found.identity != job.identity["training"]:
             raise UserError(
-                f"{job.files.parent / RESULT}: is of another configuration or data set: remove it, "
-                "or choose another out",
+                f"{job.files.parent / RESULT}: made with another configuration or data set: "
+                "remove it, or choose another out",
                 "out",
             )
         if found is not None and not found.error:
@@ -106,8 +106,8 @@ def failures(outcomes: Sequence[Outcome]) -> str:
         return ""
     first = f"{failed[0].scene}/{failed[0].setting}: {failed[0].error}"
     return (
-        f"{len(failed)} of {len(outcomes)} trainings failed, the same command tries them again; "
-        f"the first: {first}"
+        f"{len(failed)} of {len(outcomes)} trainings failed; run the same command again to retry "
+        f"them. The first: {first}"
     )
 
 
@@ -115,10 +115,10 @@ def _named(scenes: Iterable[Path]) -> list[Path]:
     """Scenes as absolute folders, whose names tell them apart."""
     folders = [Path(scene).resolve() for scene in scenes]
     if not folders:
-        raise UserError("expected a scene, a folder of photographs, or more; got none")
+        raise UserError("expected at least one scene, a folder of photographs, got none")
     if len({folder.name for folder in folders}) < len(folders):
         names = [str(folder) for folder in folders]
-        raise UserError(f"expected scenes in folders of different names, got {names}")
+        raise UserError(f"expected scene folders with different names, got {names}")
     return folders
 
 
@@ -126,7 +126,7 @@ def _distinct(settings: Sequence[Setting]) -> Sequence[Setting]:
     names = [setting.name for setting in settings]
     bad = [name for name in names if not NAME.fullmatch(name) or names.count(name) > 1]
     if bad or not names:
-        raise UserError(f"expected settings of different names, got {bad or names}")
+        raise UserError(f"expected settings with different names, got {bad or names}")
     return settings
 
 
@@ -152,7 +152,7 @@ def _outcome(job: Job, result: Result) -> Outcome:
     found = load_outcome(job.files.parent)
     if result.state == "done" and found is not None:
         return found
-    error = "; ".join(result.errors.values()) or f"left no {RESULT}"
+    error = "; ".join(result.errors.values()) or f"{RESULT} is missing"
     log.info("%s failed: %s", job.name, error)
     scene, _, setting = job.name.partition("/")
     failed = Outcome(scene, setting, job.identity["training"], error=error)

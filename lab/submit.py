@@ -56,7 +56,7 @@ TO_MAP = torch.tensor([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 def submit(
     run: str | Path, out: str | Path, samples: int = SAMPLES, bounces: int = BOUNCES
 ) -> Path:
-    """Write what Stanford-ORB measures of a run that was trained on a scene of it; return its list.
+    """Write what Stanford-ORB metrics of a run that was trained on a scene of it; return its list.
 
     Views of other scenes are rendered in the light that was measured there, where the data has it.
 
@@ -80,7 +80,7 @@ def submit(
         )
     run, out = Path(run), Path(out)
     if out.exists():
-        raise ExistingFile(f"{out} is there already: choose another out", "out")
+        raise ExistingFile(f"{out} exists already: choose another out", "out")
     photos = photos_of(run)
     folder, truth = scene_folders(photos.folder)
     scene, near = load_scene(run), albedo_near(run)
@@ -104,7 +104,7 @@ def scene_folders(folder: Path) -> tuple[Path, Path]:
     root = folder.parent.parent
     truth = root / "ground_truth" / folder.name
     if not truth.is_dir():
-        raise DataError(f"{folder}: expected a scene of Stanford-ORB with {truth}, got none there")
+        raise DataError(f"{folder}: expected a scene of Stanford-ORB with {truth}, found none")
     return root / "blender_HDR" / folder.name, truth
 
 

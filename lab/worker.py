@@ -34,7 +34,7 @@ MAP = "envmap.exr"  # the recovered light, where the run has one
 def work(folder: Path) -> None:
     """Train, evaluate and record what folder/job.json says.
 
-    A training that was broken off starts anew: one in several sittings is not what a reader of its
+    A training that was broken off starts again: one in several sittings is not what a reader of its
     figures expects. One that was finished is only evaluated; what came through in the meantime, in
     another process, stays.
     """

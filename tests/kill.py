@@ -158,7 +158,7 @@ def _read(path: Path) -> None:
             assert data[:4] == b"glTF", "no GLB"
             assert int.from_bytes(data[8:12], "little") == len(data), "of another length"
         case ".html":
-            assert path.read_text(encoding="utf-8").rstrip().endswith("</html>"), "cut short"
+            assert path.read_text(encoding="utf-8").rstrip().endswith("</html>"), "truncated"
 
 
 def left_over(folder: Path) -> list[str]:

@@ -54,7 +54,7 @@ def test_a_run_that_is_there(run):
 
 
 def test_a_folder_without_a_run(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no checkpoint in"):
+    with pytest.raises(FileNotFoundError, match="not a trained run"):
         univoxel.open_run(tmp_path)
 
 

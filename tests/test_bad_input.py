@@ -51,11 +51,11 @@ def refused(capsys):
         (shutil.rmtree, r"data: expected a folder with a scene, got nothing there"),
         (
             lambda d: (d / "transforms_train.json").write_text('{"frames": [}'),
-            r"transforms_train\.json: broken JSON in line 1, column 13",
+            r"transforms_train\.json: invalid JSON in line 1, column 13",
         ),
         (
             lambda d: [(d / "train" / f"r_{v}.png").unlink() for v in range(1, 5)],
-            r"no picture .*train/r_1, .*train/r_2, .*train/r_3, \.\.\.: 4 of 6 are missing",
+            r"missing images: .*train/r_1, .*train/r_2, .*train/r_3, \.\.\. \(4 of 6\)",
         ),
     ],
 )
@@ -84,7 +84,7 @@ def test_a_number_where_a_path_is_wanted(run, tmp_path, refused):
     refused("univoxel train: 42: expected a folder", "train", 42, "--out", tmp_path / "out")
     refused("univoxel eval: 42: expected the folder of a run", "eval", 42)
     refused("univoxel eval: 42: expected a folder with a scene", "eval", run, "--data", 42)
-    refused("univoxel relight: 42: expected a picture", "relight", run, "--envmap", 42)
+    refused("univoxel relight: 42: expected an image", "relight", run, "--envmap", 42)
     refused(r"ends in .*\.ply.*, got 42", "export", run, "--mesh", 42)
 
 
@@ -99,9 +99,9 @@ def another_version(path):
     [
         (another_version, r"scene\.safetensors: expected checkpoint format \d+, got 99"),
         (lambda p: save_file(load_file(p), p), r"expected checkpoint format \d+, got None"),
-        (lambda p: p.write_bytes(p.read_bytes()[:-9]), r"scene\.safetensors: damaged or cut short"),
-        (lambda p: p.write_bytes(b""), r"scene\.safetensors: damaged or cut short"),
-        (Path.unlink, r"no checkpoint in .*run .*univoxel train"),
+        (lambda p: p.write_bytes(p.read_bytes()[:-9]), r"scene\.safetensors: damaged or truncated"),
+        (lambda p: p.write_bytes(b""), r"scene\.safetensors: damaged or truncated"),
+        (Path.unlink, r"not a trained run .*run .*univoxel train"),
     ],
 )
 def test_checkpoints_that_cannot_be_used(run, data, tmp_path, refused, change, message):
@@ -120,7 +120,7 @@ def test_a_run_that_was_killed_before_its_first_checkpoint(run, data, capsys):
     (run / FILE).unlink()
     (run / "log.jsonl").write_text("gone\n")
     assert main(["train", str(data), "--out", str(run), "--resume", *OPTIONS]) == 0
-    assert f"nothing was saved in {run} yet: training begins\n" in capsys.readouterr().out
+    assert f"{run}: nothing was saved yet" in capsys.readouterr().out
     assert (run / FILE).is_file()
     assert "gone" not in ((run / "log.jsonl").read_text() if (run / "log.jsonl").exists() else "")
 
@@ -157,18 +157,18 @@ def nan(tensor):
         (meta(lambda m: m.update(inv_s="sharp")), "inv_s must be float, got 'sharp'"),
         (meta(lambda m: m.update(inv_s=10**400)), "inv_s must be float, got 1000"),
         (meta(lambda m: m.update(inv_s=np.nan)), "inv_s must be above 0, got nan"),
-        (meta(lambda m: m.update(levels=7)), "its own description"),
+        (meta(lambda m: m.update(levels=7)), "contradict the description"),
         (meta(lambda m: m["levels"][2].append("fine")), "voxel_sizes must be tuple"),
         (meta(lambda m: m["levels"].__setitem__(3, 3)), "rows must be a power of two"),
-        (meta(lambda m: m["levels"].__setitem__(3, 2**40)), "is expected with"),
+        (meta(lambda m: m["levels"].__setitem__(3, 2**40)), "expected field.features with"),
         (meta(lambda m: m["grid"].update(origin=None)), "origin must be tuple"),
         (meta(lambda m: m["grid"].update(size=[10**5] * 3)), "size must be 2 or more"),
-        (meta(lambda m: m["grid"].update(size=[1200] * 3)), "field.sdf is expected"),
-        (meta(lambda m: m.update(scene=[])), "its own description"),
-        (meta(lambda m: m["scene"].update(hidden=10**5)), "is expected as"),
+        (meta(lambda m: m["grid"].update(size=[1200] * 3)), "expected field.sdf"),
+        (meta(lambda m: m.update(scene=[])), "contradict the description"),
+        (meta(lambda m: m["scene"].update(hidden=10**5)), "expected material.net.0.weight with"),
         (meta(lambda m: m["scene"].update(hidden=True)), "hidden must be int"),
         (meta(lambda m: m["scene"].update(more=1)), "SceneConfig: no field 'more'"),
-        (meta(lambda m: m["scene"].pop("light")), "its own description"),
+        (meta(lambda m: m["scene"].pop("light")), "contradict the description"),
         (meta(lambda m: m["scene"].update(light=[])), "light must be an object"),
         (meta(lambda m: m["scene"].update(light={"kind": "candle"})), "light must be one of"),
         (meta(lambda m: m["scene"]["light"].update(rank=1)), "SGConfig: no field 'rank'"),
@@ -178,7 +178,7 @@ def nan(tensor):
             meta(lambda m: m["scene"]["light"].update(directions_eval=10**9)),
             r"directions_eval must be in \[1, 65536\]",
         ),
-        (meta(lambda m: m.update(state=[1])), "its own description"),
+        (meta(lambda m: m.update(state=[1])), "contradict the description"),
         (meta(lambda m: m["state"].update(stage="last")), "stage must be int"),
         (meta(lambda m: m["state"].update(progress=2)), r"progress must be in \[0, 1\]"),
         (meta(lambda m: m["state"].update(chosen=[{"what": 1}])), "what must be str"),
@@ -187,8 +187,8 @@ def nan(tensor):
             edited_tensor("material.net.0.weight", lambda t: None),
             "material.net.0.weight is missing",
         ),
-        (edited_tensor("field.feature_rows", lambda t: t - 10**6), "field.features is expected"),
-        (edited_tensor("field.feature_values", lambda t: t[:1]), "field.features is expected"),
+        (edited_tensor("field.feature_rows", lambda t: t - 10**6), "expected field.features "),
+        (edited_tensor("field.feature_values", lambda t: t[:1]), "expected field.features "),
     ],
 )
 def test_checkpoints_that_contradict_themselves(run, refused, change, message):
@@ -265,5 +265,5 @@ def test_the_template_is_sound(run, tmp_path):
     assert names == {p.name for p in out.iterdir()}
     assert {"doubt.albedo", "doubt.roughness"} <= set(read_exr(out / "r_0.exr"))
     assert 0 <= json.loads((out / "a.json").read_text())["trust"]["doubt_albedo"] <= 1
-    assert "Doubt of albedo" in (run / "trust.txt").read_text()
+    assert "Uncertainty of the albedo" in (run / "trust.txt").read_text()
     assert read_image(run / "preview.png").shape == (16, 5 * 16, 3)

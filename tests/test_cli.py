@@ -145,7 +145,7 @@ def test_capture(calls, capsys):
     assert "--minutes must be above 0" in capsys.readouterr().err
     calls.replace("capture", KeyboardInterrupt())
     assert main(["capture", "photos", "--out", "mug"]) == 130
-    assert "mug keeps the steps that are done: the same command" in capsys.readouterr().err
+    assert "finished steps are in mug: run the same command again" in capsys.readouterr().err
 
 
 def test_train_as_another_run_was_trained(calls, tmp_path, capsys):
@@ -365,7 +365,7 @@ def test_experiments(calls, tmp_path, capsys):
     assert "--minutes must be above 0, got -1" in capsys.readouterr().err
     calls.give("lab.chart", chart=calls.task("chart", KeyboardInterrupt()))
     assert main(["chart", "cup", "--out", "out"]) == 130
-    assert "out keeps the trainings that are done" in capsys.readouterr().err
+    assert "finished trainings are in out" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -475,7 +475,7 @@ def test_bad_options(calls, tmp_path, capsys, options, message):
 @pytest.mark.parametrize(
     ("arguments", "message", "see"),
     [
-        (["train"], "Missing from univoxel train: DATA ", "univoxel train"),
+        (["train"], "expected univoxel train DATA --out RUN; see ", "univoxel train"),
         (
             ["train", "x", "--out", "y", "--preset", "z"],
             "invalid choice 'z' for argument '--preset'. Expected one of ('auto', 'draft', ",
@@ -490,7 +490,7 @@ def test_bad_options(calls, tmp_path, capsys, options, message):
         (["sing"], "no command 'sing'; see ", "univoxel"),
         (["trian", "x"], "no command 'trian'; perhaps you meant train; see ", "univoxel"),
         (["lab", "comapre"], "no command 'comapre'; perhaps you meant compare", "univoxel lab"),
-        (["compare"], "Missing from univoxel lab compare: --out ", "univoxel lab compare"),
+        (["compare"], "expected univoxel lab compare SCENE ", "univoxel lab compare"),
         (["doctor", "--threads", "0"], "--threads must be at least 1, got 0", "univoxel doctor"),
         (["doctor", "--quiet", "--verbose"], "expected --quiet or --verbose, got both", "doctor"),
     ],
@@ -530,7 +530,7 @@ def test_without_a_clone_there_is_no_laboratory(calls, monkeypatch, tmp_path, ca
     monkeypatch.setattr(cli, "CLONE", tmp_path)
     assert main(arguments) == 2
     out, err = capsys.readouterr()
-    assert err.startswith("univoxel: compare, chart, stress, bank, submit measure the method and")
+    assert err.startswith("univoxel: compare, chart, stress, bank, submit are experiments, which")
     assert err.count("\n") == 1
     assert not out
     assert main(["completion", "bash"]) == 0
@@ -669,7 +669,7 @@ def test_an_interrupt_says_what_was_kept(calls, tmp_path, capsys):
     assert capsys.readouterr().err.endswith(f"interrupted; nothing was saved in {tmp_path} yet\n")
     (tmp_path / "scene.safetensors").touch()
     assert main(arguments) == 130
-    assert capsys.readouterr().err.endswith("keeps the last saved state: go on with --resume\n")
+    assert capsys.readouterr().err.endswith("continue with --resume\n")
 
 
 @pytest.mark.parametrize(
@@ -694,7 +694,7 @@ def test_help_does_not_wait_for_torch():
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
-    assert "--preset {auto,draft,fast,full,best}" in run.stdout
+    assert "--preset auto|draft|fast|full|best" in run.stdout
 
 
 @pytest.mark.parametrize(
@@ -714,9 +714,13 @@ def test_arguments_that_no_command_can_use(calls, capsys, argument, message):
 
 
 @pytest.mark.parametrize("command", [*COMMANDS, *LABORATORY])
-def test_help_names_every_default(command, capsys):
-    main([command, "--help"])
-    assert "(default: )" not in " ".join(capsys.readouterr().out.split())
+def test_help_is_short_and_fits(command, capsys):
+    assert main([command, "--help"]) == 0
+    said = capsys.readouterr().out
+    assert not re.search(r"\(default: (?:|None|False|none)\)|\(repeatable\)", said)
+    assert max(map(len, said.splitlines())) <= 100
+    texts = meanings(COMMANDS[command].record) if hasattr(COMMANDS.get(command), "record") else {}
+    assert [text for text in texts.values() if len(text) > 80] == []
 
 
 @pytest.mark.parametrize("command", [name for name in COMMANDS if name != "completion"])

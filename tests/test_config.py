@@ -44,7 +44,7 @@ def test_fine_stages_may_be_sparse():
     config = with_field(preset("fast", Path("photos"), Path("run")), "sparse")
     assert [getattr(s, "field", None) for s in config.stages] == ["dense", "sparse", None, "sparse"]
     assert config.capacity == "fixed"
-    with pytest.raises(ValueError, match="adaptive capacity, and so budget_mb, is for dense"):
+    with pytest.raises(ValueError, match="adaptive capacity and budget_mb do not work with sparse"):
         replace(config, capacity="adaptive")
     dense = with_field(preset("fast", Path("photos"), Path("run")), "dense")
     assert with_field(config, "dense") == replace(dense, capacity="fixed")
@@ -222,8 +222,8 @@ def without_newer_fields(content):
     ("cut", "refusal"),
     [
         (without_newer_fields, ""),
-        (lambda c: c["stages"][2].update(tracing=7), "the run began with other stages"),
-        (lambda c: c.update(stages=c["stages"][:3]), "the run began with other stages"),
+        (lambda c: c["stages"][2].update(tracing=7), "the run was started with another stages"),
+        (lambda c: c.update(stages=c["stages"][:3]), "the run was started with another stages"),
         (lambda c: [c], "config.json: expected an object"),
     ],
 )

@@ -170,9 +170,9 @@ def test_the_same_under_traced_light(template, tmp_path, capsys, case):
     [
         (first_views(1), "expected at least 3 photographs, got 1"),
         (first_views(2), "expected at least 3 photographs, got 2"),
-        (every_picture(lambda p, *_: 0 * p), "all 6 pictures are fully transparent"),
-        (every_picture(opaque), "all 6 pictures are fully opaque"),
-        (every_picture(one_pixel), "the silhouettes of the photographs share no volume"),
+        (every_picture(lambda p, *_: 0 * p), "all 6 images are fully transparent"),
+        (every_picture(opaque), "all 6 images are fully opaque"),
+        (every_picture(one_pixel), "the silhouettes of the photographs have no common volume"),
     ],
 )
 def test_one_clear_refusal(template, tmp_path, capsys, change, message):

@@ -12,6 +12,7 @@ import doc_python
 import doc_reference
 import doc_tables
 import doc_truth
+import doc_words
 import pytest
 
 ROOT = Path(__file__).parent.parent
@@ -23,6 +24,7 @@ def test_pages_agree_with_results_and_code():
     assert doc_prose.faults(ROOT) == []
     assert doc_names.faults(ROOT) == []
     assert doc_truth.faults(ROOT) == []
+    assert doc_words.faults(ROOT) == []
 
 
 def test_every_field_of_the_configuration_has_a_meaning():
@@ -129,6 +131,19 @@ def test_a_block_that_does_not_end_is_found(copy):
 )
 def test_measured_numbers_are_found_outside_of_blocks_and_code(text, found):
     assert [number for _, number in doc_prose.measured(text)] == found
+
+
+@pytest.mark.parametrize(("pattern", "instead", "bad"), doc_words.MARKERS + doc_words.LABELS)
+def test_every_marker_is_refused(pattern, instead, bad):
+    assert any(slip.endswith(instead) for slip in doc_words.slips(bad)), pattern
+
+
+def test_good_words_pass():
+    good = "What is a mask? Leave it alone. If there is none, the optimiser keeps `as of`."
+    assert doc_words.slips(good) == doc_words.of_page(good + "\n\n    anew\n\n*doubt*\n") == []
+    assert [line for line, _ in doc_words.of_page("One.\n\nThe log\nsays it.\n")] == [3]
+    found = doc_words.texts('"""A doubt."""\ndef command(): "Goes on."\nf"{x} stood there"')
+    assert {line for line, text in found if doc_words.slips(text)} == {2, 3}
 
 
 def test_long_lines_are_found_but_for_tables_code_and_links():

@@ -39,7 +39,7 @@ def test_the_model_draws(run):
     opened = univoxel.open_run(run)
     assert len(opened.mesh().vertices) > 100
     assert opened.verdict is None  # there was none
-    assert opened.trust.startswith("Doubt of albedo")
+    assert opened.trust.startswith("Uncertainty of the albedo")
     view = {"samples": 4, "cameras": "orbit 1", "resolution": 16}
     picture = univoxel.relight(run, CITY, **view)[0]
     assert picture.shape == (16, 16, 4)
@@ -58,7 +58,7 @@ def test_it_is_measured_and_exported(run, tmp_path):
 def test_what_it_is_told_of(run):
     found = info(run)
     assert found["result"] is None
-    assert next(iter(tables(found))).startswith("Result: not judged")
+    assert next(iter(tables(found))).startswith("Result: unknown")
     (run / "trust.txt").unlink()  # training wrote it at its end
     assert next(iter(tables(info(run)))).startswith("Result: unfinished")
 

@@ -338,5 +338,5 @@ def test_tensors_that_do_not_fit(tmp_path, scene, name, tensor):
     tensors = load_file(path)
     tensors[name] = tensor
     save_file(tensors, path, meta)
-    with pytest.raises(ValueError, match="does not fit its own description"):
+    with pytest.raises(ValueError, match="the contents contradict the description"):
         load_scene(tmp_path)

@@ -1,12 +1,12 @@
-"""univoxel: from photographs to a relightable object, on a plain CPU.
+"""univoxel: from photographs to a relightable object, on any CPU.
 
     run = univoxel.train("photos", "runs/mug", preset="fast")
-    pictures = run.relight("studio.hdr", cameras="orbit 36")
+    images = run.relight("studio.hdr", cameras="orbit 36")
 
-`open_run` opens one that is there. The tasks of the command line are functions here too:
-`capture_object(photographs, out)`, all from photographs to a mesh and a page; `find_poses(
-photographs, out)`; `cutout(data, out)` for photographs without masks; `evaluate(run)`;
-`relight(run, envmap)`, which returns pictures; and `export(run, mesh)`.
+`open_run` opens an existing run. The commands are available as functions:
+`capture_object(photographs, out)` runs all steps from photographs to a mesh and a web page;
+`find_poses(photographs, out)` finds cameras; `cutout(data, out)` makes masks; `evaluate(run)`
+measures a run; `relight(run, envmap)` renders images; `export(run, mesh)` writes a mesh.
 """
 
 from importlib import import_module
@@ -38,7 +38,7 @@ __all__ = [
     "train",
 ]
 
-# Imported when asked for: `import univoxel` does not wait for torch.
+# Imported on first use, so that `import univoxel` does not wait for torch
 _PLACES = {
     "Cancelled": ("univoxel.errors", "Cancelled"),
     "Run": ("univoxel.api", "Run"),

@@ -1,4 +1,4 @@
-"""The package as a library: `univoxel.train`, `univoxel.open_run`, and what a `Run` can do."""
+"""The library interface: `univoxel.train`, `univoxel.open_run` and the class `Run`."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ __all__ = ["Run", "TrainingProgress", "open_run", "train"]
 
 
 class Run:
-    """A trained scene, and the folder that it lies in.
+    """A trained scene in its folder.
 
     Attributes:
-        path: the folder, as training wrote it.
+        path: the folder that training wrote.
         scene: field, materials and light, in evaluation mode.
     """
 
@@ -50,8 +50,8 @@ class Run:
     def __init__(self, path: str | Path) -> None:
         """
         Raises:
-            MissingFile: no trained scene is there.
-            DataError: it cannot be read.
+            MissingFile: the folder has no trained scene.
+            DataError: the scene cannot be read.
         """
         self.path = Path(path)
         self.scene = load_scene(self.path)
@@ -60,7 +60,7 @@ class Run:
         return f"Run({str(self.path)!r})"
 
     def _repr_html_(self) -> str | None:
-        """The page of `univoxel view` in a frame, for notebooks; None where there is no surface."""
+        """The web page of `univoxel view` in a frame, for notebooks; None without a surface."""
         try:
             options = page_options(self.path) | {"texture_size": SMALL.texture_size}
             text = page_text(self.path, self.scene, replace(SMALL, **options))
@@ -73,12 +73,15 @@ class Run:
     def render(
         self, cameras: str | Path | Cameras = "test", resolution: int | None = None
     ) -> Tensor:
-        """Pictures in the light of the photographs: [F, H, W, 4] linear RGBA, premultiplied.
+        """Render the scene in the light of the photographs.
 
         Args:
-            cameras: "test" for the test views of the data trained on, "orbit" or "orbit N" for N
-                frames around the object, a file in the form of transforms_test.json, or cameras.
-            resolution: pixels along the width; None: as the data's, an orbit's 512.
+            cameras: "test" for the test views of the data set, "orbit" or "orbit N" for N frames
+                around the object, a file like transforms_test.json, or cameras.
+            resolution: width in pixels; None: that of the data set, or 512 for an orbit.
+
+        Returns:
+            [F, H, W, 4] linear RGBA, premultiplied.
 
         Raises:
             UserError: the cameras cannot be used.
@@ -99,10 +102,10 @@ class Run:
         cameras: str | Path | Cameras = "test",
         **options: Any,
     ) -> Tensor:
-        """Pictures under new light: [F, H, W, 4] linear RGBA, premultiplied.
+        """Render the scene under new light: [F, H, W, 4] linear RGBA, premultiplied.
 
         Args:
-            envmap: a file, a map, or None for suns and point lights alone.
+            envmap: a file or an environment map; None for suns and point lights only.
             cameras, options: fields of `univoxel.cli.relight.RelightOptions`.
 
         Raises:
@@ -111,21 +114,21 @@ class Run:
         return relight_images(self.path, envmap, cameras, **options)
 
     def export(self, path: str | Path, **options: Any) -> Path:
-        """Write the surface with its materials as .glb, .usdz, .obj or .ply; return the file.
+        """Export the surface with materials as .glb, .usdz, .obj or .ply; return the file.
 
         Args:
-            options: fields of `univoxel.cli.export.ExportOptions`, but run and mesh.
+            options: fields of `univoxel.cli.export.ExportOptions`, except run and mesh.
 
         Raises:
             UserError: an argument is out of range, or there is no surface.
-            MissingExtra: .usdz without usd-core.
+            MissingExtra: .usdz needs usd-core.
             OSError: a file cannot be written.
         """
         export(self.path, path, **options)
         return Path(path)
 
     def page(self, path: str | Path, **options: Any) -> Path:
-        """Write one web page to look at it, to light it and to send it; return the file.
+        """Write a web page with a relightable view of the object; return the file.
 
         Args:
             options: fields of `univoxel.output.page.PageOptions`.
@@ -137,10 +140,10 @@ class Run:
         return write_page(self.path, path, **page_options(self.path) | options)
 
     def report(self, path: str | Path | None = None, **options: Any) -> Path:
-        """Write one web page that says how good it is and what to photograph next; return the file.
+        """Write a report on the quality and on what to photograph next; return the file.
 
         Args:
-            path: .html file; report.html in the run's folder when left out.
+            path: .html file; None: report.html in the folder of the run.
             options: fields of `univoxel.output.report.ReportOptions`.
 
         Raises:
@@ -150,10 +153,10 @@ class Run:
         return report(self.path, path, **options)
 
     def light(self, height: int = MAP_ROWS) -> EnvMap:
-        """The environment map that was recovered, `height` rows of it.
+        """The recovered environment map with `height` rows.
 
         Raises:
-            UserError: this run has none: it was trained with local light alone.
+            UserError: the run has none, because it was trained with local light only.
         """
         return EnvMap(recovered_map(self.scene, self.path, height))
 
@@ -162,42 +165,41 @@ class Run:
         """The surface as triangles, with materials at the vertices.
 
         Raises:
-            NoSurface: there is none.
+            NoSurface: the scene has no surface.
         """
         return extract_mesh(self.scene)
 
     @property
     def trust(self) -> str:
-        """What the photographs leave open, in words; empty where the run has no trust.txt."""
+        """The result and its uncertainty in words, from trust.txt; empty if there is none."""
         file = self.path / "trust.txt"
         return file.read_text(encoding="utf-8") if file.is_file() else ""
 
     @property
     def verdict(self) -> Verdict | None:
-        """How training came out and what would help; None: it has not ended, or its version told
-        nothing."""
+        """The verdict and its remedies; None if training has not ended, or is older than 0.3."""
         return load_verdict(self.path)
 
     @property
     def log(self) -> list[dict[str, Any]]:
-        """What training reported, every few seconds: time, losses, held-out quality."""
+        """The training log, with an entry every few seconds: time, losses, validation PSNR."""
         file = self.path / LOG
         if not file.is_file():
             return []
         return [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
 
     def evaluate(self, **options: Any) -> dict[str, float | int | None]:
-        """Measures on the test views; options: fields of `univoxel.cli.evaluate.EvaluateOptions`,
-        but run."""
+        """Metrics on the test views; options: fields of `univoxel.cli.evaluate.EvaluateOptions`,
+        except run."""
         return evaluate(self.path, **options)
 
 
 def open_run(path: str | Path) -> Run:
-    """The run in a folder.
+    """Open the run in a folder.
 
     Raises:
-        MissingFile: no trained scene is there.
-        DataError: it cannot be read.
+        MissingFile: the folder has no trained scene.
+        DataError: the scene cannot be read.
     """
     return Run(path)
 
@@ -239,26 +241,26 @@ def train(
     view: tuple[str, int] | None = None,
     **options: Any,
 ) -> Run | Path:
-    """Recover geometry, materials and light from posed photographs.
+    """Recover shape, materials and light from posed photographs.
 
     Args:
-        data: folder of the photographs and their cameras; or the whole configuration, which says
-            all but resume, timelapse, on_progress and view: then the folder of the run is returned.
-        out: folder that the run is written to.
-        resume: go on with the run in out from its last checkpoint.
-        timelapse: .gif, .mp4 or folder for pictures of a view over training time.
-        on_progress: called every few seconds of training. Raise `univoxel.Cancelled` in it to end
-            the training: it is saved, and goes on with resume.
-        view: host and port that browsers may look at the training at, such as ("127.0.0.1", 8080);
-            port 0: any free one. A button there ends it early, with a result.
-        options: fields of `univoxel.cli.train.TrainOptions`, such as preset, light, varying,
-            minutes and changes: what `univoxel train` has options for, with changes for --set.
+        data: folder with the photographs and their cameras, or a complete configuration. With a
+            configuration, pass no options; the folder of the run is returned instead of a `Run`.
+        out: folder to write the run to.
+        resume: resume the run in out from its last checkpoint.
+        timelapse: .gif, .mp4 or folder to record a view to during training.
+        on_progress: called every few seconds. To end the training, raise `univoxel.Cancelled` in
+            it: the state is saved, and you can resume.
+        view: host and port at which browsers can watch the training, such as ("127.0.0.1", 8080);
+            port 0: any free port. A button on the page ends the training early, with a result.
+        options: fields of `univoxel.cli.train.TrainOptions`, such as preset, light, varying and
+            minutes. They are the options of `univoxel train`; --set is called changes.
 
     Raises:
         UserError: an argument or the data cannot be used.
         ExistingFile: out holds a run already and resume is False.
         Cancelled: on_progress raised it.
-        OSError: a file of the run cannot be written; what was there before stays.
+        OSError: a file of the run cannot be written; earlier files are unchanged.
     """
     watched = {"timelapse": timelapse, "on_progress": on_progress, "view": view}
     if isinstance(data, TrainConfig):

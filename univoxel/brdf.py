@@ -63,7 +63,7 @@ def split(base: Tensor, metallic: Tensor | None) -> tuple[Tensor, Tensor | float
 
 
 def metal_or_none(metallic: Tensor | None) -> Tensor | None:
-    """Metallic [...], or None where no value of it would show in 8 bits: a dielectric scene."""
+    """Metallic [...], or None if no value of it would show in 8 bits: a dielectric scene."""
     return metallic if metallic is not None and (metallic > 0.5 / 255).any() else None
 
 

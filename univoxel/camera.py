@@ -1,5 +1,5 @@
-"""Pinhole cameras, rays through their pixels, the circle that they stand on, and learned
-corrections of their poses."""
+"""Pinhole cameras, rays through their pixels, circles of cameras, and learned corrections of their
+poses."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def stacked(pictures: Sequence[Tensor], beyond: float = 0) -> Tensor:
     """Pictures [h, w, ...] of any sizes as `Cameras` has them stored: [V, H, W, ...].
 
     Args:
-        beyond: what stands where there is no picture.
+        beyond: what is if there is no picture.
     """
     first = pictures[0]
     if all(picture.shape == first.shape for picture in pictures):
@@ -167,7 +167,7 @@ ON = 0.005
 # in five thousand times
 STRAY = 3.5
 LEAST = 0.007  # of the radius: below it nobody minds, 0.4 degrees
-MOST = 0.1  # of the radius: what stands further away was put there
+MOST = 0.1  # of the radius: what is further away was put there
 MAJORITY = 0.75  # share of the cameras, on the circle at least
 AROUND = 0.3  # narrower over wider spread in the circle's plane, at least: a short arc has any axis
 
@@ -240,7 +240,7 @@ def _through(chosen: Tensor, place: Tensor) -> Circle | None:
     return Circle(centre, axis, radius, torch.hypot(height, across - radius) / radius)
 
 
-# What the cameras of the photographs are off by, learned beside the scene.
+# Pose errors of the cameras, learned together with the scene.
 
 
 class PoseSteps(nn.Module):

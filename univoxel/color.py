@@ -1,4 +1,4 @@
-"""The sRGB transfer function and its slope: linear radiance inside, sRGB in pictures."""
+"""The sRGB transfer function and its slope: computations are linear, images are sRGB."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def linear_to_srgb(linear: Tensor) -> Tensor:
 
 
 def linear_to_srgb_unclipped(linear: Tensor) -> Tensor:
-    """`linear_to_srgb` that goes on above 1: a value that is too bright still has a gradient."""
+    """`linear_to_srgb` that continues above 1: a value that is too bright still has a gradient."""
     return _srgb_curve(linear.clamp_min(0.0))
 
 

@@ -1,4 +1,4 @@
-"""The whole configuration of a training run, and its file."""
+"""The complete configuration of a training, and its file."""
 
 from __future__ import annotations
 
@@ -45,53 +45,44 @@ PREPARATION = 0.25
 
 @dataclass(frozen=True)
 class StageConfig:
-    """One stage of training, on a grid of its own resolution."""
+    """A stage of training at one grid resolution. Pairs are values at the start and the end."""
 
     voxels: float = field(
-        metadata=about("in the object's box at most; see voxel_pixels", unit="millions", above=0)
+        metadata=about("most in the object's box; see voxel_pixels", unit="millions", above=0)
     )
-    iterations: int = field(metadata=about("optimisation steps; fewer when time runs out", least=1))
+    iterations: int = field(metadata=about("optimisation steps; fewer if time runs out", least=1))
     share: float = field(
-        metadata=about("of the time that is left for stages under a limit", above=0, most=1)
+        metadata=about("share of the remaining time, if there is a time limit", above=0, most=1)
     )
-    rays: int = setting(2048, "per step", least=1)
+    rays: int = setting(2048, "rays per step", least=1)
     sharpness: tuple[float, float] = setting(
-        (0.5, 0.3), "s of the NeuS density at begin and end", unit="voxels", above=0
+        (0.5, 0.3), "s of the NeuS density at the start and the end", unit="voxels", above=0
     )
     lr_sdf: tuple[float, float] = setting(
-        (0.07, 0.005), "learning rate at begin and end", unit="voxels per step", above=0
+        (0.07, 0.005), "learning rate at the start and the end", unit="voxels per step", above=0
     )
     lr_features: tuple[float, float] = setting(
-        (0.1, 0.01),
-        "learning rate at begin and end: of features, and of the table of mirrored directions",
-        above=0,
+        (0.1, 0.01), "learning rate of features and the table of reflections", above=0
     )
     lr_networks: tuple[float, float] = setting(
-        (6e-3, 3e-4),
-        "learning rate at begin and end: of the networks, the light, and what differs from view to "
-        "view",
-        above=0,
+        (6e-3, 3e-4), "learning rate of networks, light and per-view parameters", above=0
     )
     plate: float = setting(
-        0.003, "thin-plate smoothing of touched sdf nodes per step", least=0, most=0.125
+        0.003, "thin-plate smoothing of the updated sdf nodes, per step", least=0, most=0.125
     )
-    spread: int = setting(4, "passes that smooth the sdf's gradient before the optimiser", least=0)
+    spread: int = setting(4, "smoothing passes over the sdf's gradient", least=0)
     diffusion: float = setting(
-        0.01, "smoothing of touched feature nodes per step", least=0, most=0.25
+        0.01, "smoothing of the updated feature nodes, per step", least=0, most=0.25
     )
     physical_from: float = setting(
-        0.3, "progress at which the physically based render joins", least=0, most=1
+        0.3, "progress at which the physically based render is added", least=0, most=1
     )
     patches_from: float = setting(
-        0.0,
-        "progress at which patches of the surface are compared between photographs; 1: never",
-        least=0,
-        most=1,
+        0.0, "progress at which patches are compared between photographs", least=0, most=1
     )
-    refit: bool = setting(False, "materials stay; light, radiance and silhouettes follow them")
+    refit: bool = setting(False, "freeze materials; fit light, radiance, silhouettes")
     field: FieldName = setting(
-        "hash",
-        "sparse: only bricks around the surface are stored; hash: features come from a hash table",
+        "hash", "storage of features: every grid node, bricks at the surface, or a hash table"
     )
 
     __post_init__ = check_settings
@@ -99,27 +90,16 @@ class StageConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of the losses; the photometric loss of the physically based render has 1."""
+    """Weights of the losses, relative to the photometric loss of the physically based render."""
 
-    radiance: float = setting(1.0, "photometric loss of what the radiance head shows", least=0)
-    silhouette: float = setting(0.1, "rays' opacity against the masks", least=0)
-    metallic: float = setting(
-        0.01, "what the mean metallic costs: metal is for where nothing else serves", least=0
-    )
-    light_smoothness: float = setting(
-        0.1, "change of a local light over about a voxel, L1", least=0
-    )
-    white_light: float = setting(
-        0.01,
-        "distance of the light from grey on the whole, as a share of it: photographs fix albedo "
-        "and light up to a colour only",
-        least=0,
-    )
-    map_smoothness: float = setting(1e-3, "total variation of the log map", least=0)
+    radiance: float = setting(1.0, "photometric loss of the radiance head's render", least=0)
+    silhouette: float = setting(0.1, "difference between ray opacity and masks", least=0)
+    metallic: float = setting(0.01, "penalty on the mean metallic value", least=0)
+    light_smoothness: float = setting(0.1, "L1 change of local light over about a voxel", least=0)
+    white_light: float = setting(0.01, "relative distance of the mean light from grey", least=0)
+    map_smoothness: float = setting(1e-3, "total variation of the log environment map", least=0)
     patches: float = setting(
-        0.4,
-        "what patches of the surface lack in correlation between photographs, in every second step",
-        least=0,
+        0.4, "missing correlation of patches between photographs, every second step", least=0
     )
 
     __post_init__ = check_settings
@@ -127,10 +107,10 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class EntropyConfig:
-    """The prior that paint comes in few colours, see training/albedo_entropy.py."""
+    """The prior that an object has few albedo colours, see training/albedo_entropy.py."""
 
     teaching_steps: int = setting(
-        60, "steps in which the materials learn the albedos under a map that was changed", least=1
+        60, "steps to learn new albedos after the environment map changed", least=1
     )
 
     __post_init__ = check_settings
@@ -138,38 +118,34 @@ class EntropyConfig:
 
 @dataclass(frozen=True)
 class JointConfig:
-    """The stage that solves for one map, the materials and normals, see training/joint_solve.py."""
+    """Joint optimisation of one environment map, materials and normals: training/joint_solve.py."""
 
-    iterations: int = setting(675, "Adam steps in all rounds; fewer when time runs out", least=1)
-    share: float = setting(0.27, "of the time budget", above=0, most=1)
+    iterations: int = setting(675, "Adam steps in all rounds; fewer if time runs out", least=1)
+    share: float = setting(0.27, "share of the time limit", above=0, most=1)
     rays: int = setting(2048, "observations per step; at least views")
     views: int = setting(4, "observations of a point per step", least=1)
-    rounds: int = setting(4, "of Newton steps on the map and then of Adam", least=1)
-    points: int = setting(20400, "on the surface", least=1)
+    rounds: int = setting(4, "rounds of Newton steps on the map and Adam steps", least=1)
+    points: int = setting(20400, "number of surface points", least=1)
     tracing: int = setting(2, "visibility rays per point and direction", least=1)
-    colors: bool = setting(True, "whether the light minimises the entropy of albedo, see entropy")
+    colors: bool = setting(True, "minimise the entropy of the albedo; see entropy")
     only_metal: bool | None = setting(
-        None, "whether all is metal, as dark as it looks, and the map neutral; None: trials decide"
+        None, "whether the whole object is metal; None: a multi-start initialisation decides"
     )
-    lr_features: float = setting(0.03, "learning rate at the begin of a round", above=0)
+    lr_features: float = setting(0.03, "learning rate of features at the start of a round", above=0)
     lr_networks: float = setting(
-        3e-3,
-        "learning rate at the begin of a round: of the materials' head and the views' gains",
-        above=0,
+        3e-3, "learning rate of material head and gains at the start of a round", above=0
     )
-    lr_map: float = setting(0.05, "learning rate of the log map", above=0)
+    lr_map: float = setting(0.05, "learning rate of the log environment map", above=0)
     lr_sdf: float = setting(
-        0.04, "learning rate of the surface; 0: it stays", unit="voxels per step", least=0
+        0.04, "learning rate of the surface; 0: frozen", unit="voxels per step", least=0
     )
-    newton_steps: int = setting(3, "at the begin of a round", least=0)
-    newton_points: int = setting(1900, "of the points", least=1)
-    newton_views: int = setting(8, "observations of each", least=2)
+    newton_steps: int = setting(3, "Newton steps at the start of a round", least=0)
+    newton_points: int = setting(1900, "number of points in a Newton step", least=1)
+    newton_views: int = setting(8, "observations of each of these points", least=2)
     newton_smooth: float = setting(
-        1e-7, "Laplacian on the log map against the mean squared residual", above=0
+        1e-7, "weight of the log map's Laplacian, relative to the mean squared residual", above=0
     )
-    entropy: EntropyConfig = setting(
-        EntropyConfig(), "the prior on few colours, where colors is set"
-    )
+    entropy: EntropyConfig = setting(EntropyConfig(), "prior on few colours, used with colors")
 
     def __post_init__(self) -> None:
         check_settings(self)
@@ -178,116 +154,84 @@ class JointConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """A training."""
+    """The complete configuration of a training."""
 
     data: Path = field(metadata=about("folder of the data set"))
     out: Path = field(metadata=about("folder of the run"))
     stages: tuple[StageConfig | JointConfig, ...] = field(
-        metadata=about(
-            "in the order in which they are trained, one at least: a StageConfig first, which "
-            "makes the grid"
-        )
+        metadata=about("stages in order; the first is a StageConfig, which creates the grid")
     )
     minutes: float | None = setting(
-        None,
-        "wall-clock limit from the first photograph read to the end: what does not fit is cut, in "
-        "all stages alike; None: all steps are made, however long they take",
-        above=0,
+        None, "time limit, including preparation; stages are shortened alike to fit", above=0
     )
     downscale: int = setting(
-        0,
-        "pixels of the photographs along a side of one that is trained on; 0: as many as leave "
-        "what grids can use, 1 for photographs of 1499 pixels and fewer. A run's config.json has "
-        "the number that was found",
-        least=0,
+        0, "train at 1/N of the photographs' size; 0: no more pixels than grids can use", least=0
     )
     voxel_pixels: float = setting(
-        1.0,
-        "pixels of the photographs, where the object is, that a voxel is at least as wide as: a "
-        "finer grid would only learn their noise",
-        least=0,
+        1.0, "minimum width of a voxel in pixels of the photographs, at the object", least=0
     )
-    seed: int = setting(
-        0,
-        "of the random numbers of training: first parameters, rays, points. Which rays are held "
-        "out does not depend on it",
-    )
-    masks: MasksFrom = setting(
-        "auto",
-        "auto: masks that end outside of the object, as the photographs show it, are taken in",
-    )
+    seed: int = setting(0, "random seed; it does not change the validation pixels")
+    masks: MasksFrom = setting("auto", "auto: masks that extend past the object's edge are eroded")
     cameras: CamerasFrom = setting(
-        "auto",
-        "refined: the photographs' cameras are put right, before training and in it; auto: where "
-        "their silhouettes contradict one another",
+        "auto", "refined: optimise camera poses; auto: only if silhouettes are inconsistent"
     )
     exposures: bool = setting(
-        True,
-        "whether photographs are looked at for exposures that differ; where they do, scene.varying "
-        "becomes exposure, of none",
+        True, "look for different exposures; if found, scene.varying none becomes exposure"
     )
     allow_outside: bool = setting(
-        False, "whether what the data set's files and links name may lie outside of its folder"
+        False, "also read files outside the folder if the data set refers to them"
     )
     light_frame: LightFrameOrAuto = setting(
         "auto",
-        "what the light stands still in: the world of the cameras; the room of a turntable, whose "
-        "camera stood still too; or the camera, whose flash lights the object beside what stands "
-        "around it; auto: what explains best how colours change from photograph to photograph. "
-        "scene.turntable then holds the axis, scene.flash the distance",
+        "world: the light stood still; turntable: it moved with the camera, see scene.turntable; "
+        "camera: a flash, see scene.flash; auto: the best explanation of colour changes",
     )
     detail: Detailing = setting(
-        "texture",
-        "texture: after training, albedo comes from the photographs at their own size, where they "
-        "show more than the grid holds",
+        "texture", "texture: refine the albedo from full-size photographs after training"
     )
     carving_seconds: float = setting(
         12.0,
-        "that carving concavities before training may be expected to take on two cores, or they "
-        "are left alone: those that no silhouette shows, where photographs agree on them. Never "
-        "where their light varies, other than in exposure; 0: never",
+        "most expected time on two cores for carving concavities; skipped if the light varies",
         unit="seconds",
         least=0,
     )
     patience: float = setting(
         0.0,
-        "that held-out rays must gain in 15 % of a stage, or it is shortened; 0: never",
+        "validation gain in 15 % of a stage, below which the stage is shortened; 0: never",
         unit="dB",
         least=0,
     )
-    capacity: Capacity = setting(
-        "adaptive", "adaptive: sizes above are limits, see training/compression.py"
-    )
+    capacity: Capacity = setting("adaptive", "adaptive: shrink the model as validation allows")
     budget_mb: float | None = setting(
-        None, "that the model's file may have; adaptive only", unit="1e6 bytes", above=0
+        None, "maximum size of the model file; needs adaptive capacity", unit="1e6 bytes", above=0
     )
-    scene: SceneConfig = setting(SceneConfig(), "sizes of the model, and what light it has")
-    loss: LossConfig = setting(LossConfig(), "weights in each StageConfig")
+    scene: SceneConfig = setting(SceneConfig(), "sizes of the model, and its lighting model")
+    loss: LossConfig = setting(LossConfig(), "weights of the losses in each StageConfig")
 
     def __post_init__(self) -> None:
         check_settings(self)
         check_fields(self, "a path", lambda x: isinstance(x, Path), "data", "out")
         check_fields(self, "a path in UTF-8", _is_utf8, "data", "out")
-        first = "a StageConfig first, which makes the grid"
+        first = "a StageConfig first, which creates the grid"
         check_fields(self, first, lambda x: x and isinstance(x[0], StageConfig), "stages")
         kinds = [s.field for s in self.stages if isinstance(s, StageConfig)]
         if "hash" in kinds and set(kinds) != {"hash"}:
             raise ConfigError(
-                f"TrainConfig: hash is for all stages or none, got {', '.join(kinds)}"
+                f"TrainConfig: either all stages use hash or none does, got {', '.join(kinds)}"
             )
         if kinds != sorted(kinds):
             raise ConfigError(
-                f"TrainConfig: no dense stage can follow a sparse one, got {', '.join(kinds)}"
+                f"TrainConfig: a dense stage cannot follow a sparse one, got {', '.join(kinds)}"
             )
         if "hash" in kinds and self.scene.channels % PER_LEVEL:
             raise ConfigError(
-                f"TrainConfig: the hash field has {PER_LEVEL} channels a level: scene.channels "
+                f"TrainConfig: the hash field has {PER_LEVEL} channels per level: scene.channels "
                 f"must be a multiple of that, got {self.scene.channels}"
             )
         if self.capacity == "adaptive" and "sparse" in kinds:
             raise ConfigError(
-                "TrainConfig: adaptive capacity, and so budget_mb, is for dense and hash fields: "
-                "leave it out, or the sparse field",
+                "TrainConfig: adaptive capacity and budget_mb do not work with sparse fields: "
+                "use another field, or leave them out",
                 "budget_mb",
             )
         if not self.scene.sky_nodes and any(isinstance(s, JointConfig) for s in self.stages):
@@ -309,9 +253,9 @@ def _is_utf8(path: Path) -> bool:
 
 
 def save_config(cfg: TrainConfig) -> None:
-    """Write the resolved configuration to config.json in the run's folder, whole or not at all.
+    """Write the resolved configuration to config.json in the run's folder, atomically.
 
-    The version of the package stands before it: constants that are no fields are those of it.
+    The version of the package comes first, because it determines all other constants.
 
     Raises:
         OSError: it cannot be written.
@@ -343,7 +287,7 @@ def load_config(path: Path) -> TrainConfig:
 
 
 def check_same(cfg: TrainConfig) -> None:
-    """Refuse to go on with the run in cfg.out under stages or a model that it did not begin with.
+    """Refuse to resume the run in cfg.out with other stages or another model.
 
     Raises:
         UserError: they differ, or config.json cannot be read.
@@ -352,7 +296,7 @@ def check_same(cfg: TrainConfig) -> None:
     try:
         before = read_json(path)
     except (OSError, UserError) as error:
-        raise UserError(f"{path}: cannot be read, so the run cannot go on: {error}") from None
+        raise UserError(f"{path}: this run cannot be resumed: {error}") from None
     if not isinstance(before, dict):
         raise UserError(f"{path}: expected an object with the configuration, got {before!r:.80}")
     began = _completed(before, cfg)
@@ -366,7 +310,7 @@ def check_same(cfg: TrainConfig) -> None:
     for name in [*names.split(), "light_frame"]:
         if began.get(name) != now[name]:
             raise UserError(
-                f"{path}: the run began with other {name}: resume with the same "
+                f"{path}: the run was started with another {name}: to resume it, pass the same "
                 f"{', '.join(CHOICES[:-1])} and {CHOICES[-1]} as then",
                 *CHOICES,
             )

@@ -40,7 +40,7 @@ class EnvMap:
             )
         if r.dtype != torch.float32:
             raise ValueError(f"environment map: expected float32 radiance, got {r.dtype}")
-        low, high = r.aminmax()  # NaN where there is one
+        low, high = r.aminmax()  # NaN if there is one
         if not (low >= 0 and high < math.inf):
             bad = (~r.isfinite() | (r < 0)).nonzero()
             row, column, channel = bad[0].tolist()
@@ -171,8 +171,8 @@ def read_map(path: Path) -> EnvMap:
     """
     if path.suffix.lower() in SUFFIXES and kind_of(path) not in (".exr", ".hdr"):
         raise DataError(
-            f"{path}: expected a map of light, .hdr or .exr, got a picture: the sun is thousands "
-            "of times as bright as 8 or 16 bits can say"
+            f"{path}: expected an environment map, .hdr or .exr, got an image with 8 or 16 bits, "
+            "which cannot hold the brightness of the sun"
         )
     radiance = read_image(path, infinite=True)
     if radiance.dim() == 3 and radiance.shape[2] == 4:
@@ -180,7 +180,7 @@ def read_map(path: Path) -> EnvMap:
     low, high = radiance.aminmax()
     if high == math.inf:  # of a sun that half floats do not hold
         largest = torch.where(radiance.isfinite(), radiance, 0).max()
-        log.warning("%s: infinite radiance is taken as the largest there is, %g", path, largest)
+        log.warning("%s: infinite radiance is replaced by %g", path, largest)
         radiance = radiance.clamp_max(largest)
         high = largest
     if 0 > low >= -UNDERSHOOT * high:  # as filters and denoisers leave it
@@ -192,7 +192,7 @@ def read_map(path: Path) -> EnvMap:
 
 
 def true_map(data: Path) -> Tensor | None:
-    """The light of the photographs, where the data set has it."""
+    """The true light of the photographs, if the data set has it."""
     for suffix in (".hdr", ".exr"):
         path = data / "envmaps" / f"train{suffix}"
         if path.is_file():

@@ -1,4 +1,4 @@
-"""Mistakes of a user, as exceptions with one root."""
+"""Exceptions for mistakes of the user, with a common base class."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ from collections.abc import Sequence
 
 
 def some(names: Sequence[object], most: int = 5) -> str:
-    """The first of many names, for a message."""
+    """The first of the names, joined for a message."""
     return ", ".join(map(str, names[:most])) + (", ..." if len(names) > most else "")
 
 
 class Cancelled(Exception):
-    """Raised in on_progress by a caller of the package: ends a training, which can be resumed."""
+    """Raise it in on_progress to end a training, which can then be resumed."""
 
 
 class UserError(ValueError):
-    """A mistake of the user: the message says what was expected and what came.
+    """A mistake of the user: the message says what was expected and what was found.
 
-    The command line shows it as one line. Every other exception, but for files of the user that
-    cannot be read or written, is a fault of the program and keeps its traceback.
+    The command line prints it as one line. All other exceptions, except for user files that cannot
+    be read or written, are bugs of the program and keep their traceback.
 
     Args:
-        message: names Python arguments; a value to choose stands as `argument=value`.
-        arguments: names in the message that the command line replaces by its options.
+        message: refers to Python arguments; a value to choose is written as `argument=value`.
+        arguments: names in the message that the command line replaces with its options.
     """
 
     def __init__(self, message: str = "", *arguments: str) -> None:
@@ -31,35 +31,35 @@ class UserError(ValueError):
 
 
 class ConfigError(UserError):
-    """A configuration that contradicts itself, or a field of one that is out of range."""
+    """A configuration that is contradictory, or has a field that is out of range."""
 
 
 class DataError(UserError):
-    """Input that cannot be used: the message names the file, what was expected and what came."""
+    """Input that cannot be used: the message names the file, and what was expected and found."""
 
 
 class WithoutMasks(DataError):
-    """Photographs that nothing says of which pixels show the object."""
+    """Photographs without masks."""
 
 
 class StillBackground(DataError):
-    """Photographs of an object that was turned before a still camera, and no masks of it.
+    """Photographs without masks of an object that was turned before a static camera.
 
     Args:
-        seen: how that was seen.
+        seen: the evidence, in words.
     """
 
     def __init__(self, seen: str):
         super().__init__(
-            f"{seen}: the object was turned before a still camera. Only what is on the object "
-            "counts: make masks of it and give them as masks=DIR",
+            f"{seen}: it seems that the object was turned before a static camera. Make masks of "
+            "the object and pass them as masks=DIR, so that the background is ignored",
             "masks",
         )
         self.seen = seen
 
 
 class NoSurface(UserError):
-    """A scene without a surface, or none of it in any photograph."""
+    """A scene without a surface, or whose surface is in no photograph."""
 
 
 class FileError(UserError, OSError):
@@ -67,20 +67,20 @@ class FileError(UserError, OSError):
 
 
 class MissingFile(FileError, FileNotFoundError):
-    """A file that is expected and not there."""
+    """A file that does not exist."""
 
 
 class ExistingFile(FileError, FileExistsError):
-    """A file or folder in the way, which would be overwritten."""
+    """A file or folder that would be overwritten."""
 
 
 class MissingExtra(UserError, ImportError):
-    """An optional package that is not installed: the message says how to install it."""
+    """An optional package is not installed: the message says how to install it."""
 
 
 class MissingNative(UserError, RuntimeError):
-    """A part of the compiled extension that was not built: the message says how to build it."""
+    """A part of the compiled extension was not built: the message says how to build it."""
 
 
 class ProcessFailed(UserError, RuntimeError):
-    """Another process, a training or a renderer, that did not end well or is in the way."""
+    """Another process, such as a training or a renderer, failed or is in the way."""

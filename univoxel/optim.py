@@ -1,4 +1,4 @@
-"""Adam that touches only the rows of a grid that got a gradient."""
+"""Adam that updates only the rows of a grid that received a gradient."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class RowAdam(torch.optim.Optimizer):
         _plain(torch.optim.Optimizer.add_param_group)(self, param_group)
 
     def zero_grad(self, set_to_none: bool = True) -> None:
-        """As of any optimizer."""
+        """As in any optimizer."""
         _plain(torch.optim.Optimizer.zero_grad)(self, set_to_none)
 
     @torch.no_grad()

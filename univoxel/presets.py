@@ -1,4 +1,4 @@
-"""Presets: amounts of work, and the work that fits into a time."""
+"""Presets: amounts of work, and the amount that fits a time limit."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Work:
     # Rates at the beginning of a stage: few steps want larger ones
     lr_networks: float
     lr_sdf: float
-    # Of the joint solve under the hybrid light: normals want steps more than observations
+    # Of the joint optimisation under the hybrid light: normals want steps more than observations
     joint_steps: float
     observations: float  # per step
     directions: float  # of the light at a point, per step; the hybrid light's turn at random
@@ -49,11 +49,11 @@ CARVING = 0.1  # share of the minutes: where carving takes more it costs more th
 def preset(
     name: str, data: Path, out: Path, light: LightName = "hybrid", varying: Differing = "auto"
 ) -> TrainConfig:
-    """The configuration of a preset: draft (1 minute), fast (2), full (5) or best (8) on two cores.
+    """The configuration of a preset: draft, fast, full or best.
 
-    A preset is an amount of work: every machine makes all of its steps, however long they take. Its
-    sizes are limits: capacity is adaptive under the hybrid light, and fixed under others, which are
-    there to be compared.
+    A preset is an amount of work, designed for about 1, 2, 5 or 8 minutes on two cores. Every
+    machine makes all of its steps, however long they take. Its sizes are upper limits: capacity is
+    adaptive with the hybrid light, and fixed with the others, which serve for comparison.
 
     Args:
         light, varying: see `budget`.
@@ -69,23 +69,22 @@ def preset(
 def budget(
     minutes: float, data: Path, out: Path, light: LightName = "hybrid", varying: Differing = "auto"
 ) -> TrainConfig:
-    """The configuration for a limit of time, in minutes on two cores: the presets and what lies
-    between.
+    """The configuration for a time limit in minutes on two cores: a preset or one in between.
 
     Args:
-        minutes: above 0, from the first photograph read to the end. Reading and preparation are
-            left a quarter of them.
-        light: "sg", local lobes as published; "hybrid", local lobes while geometry forms, then one
-            environment map with traced visibility for the materials, then lobes that follow them;
-            "sh" and "mlp", local light of another form; "envmap-sg" and "envmap", one map with
-            traced visibility from the beginning; "baked", none: the photographs' colours are taken
-            for albedo. docs/guide/lights.md tells them apart.
-        varying: what differs from photograph to photograph: "none"; "exposure", a gain per channel;
-            "light", the light itself too; "auto", exposure where they are seen to differ.
+        minutes: above 0, from reading the first photograph to the end. A quarter of it is for
+            reading and preparation.
+        light: "sg", local lobes as published; "hybrid", local lobes while the shape forms, then one
+            environment map with traced visibility for the materials, then lobes fitted to them;
+            "sh" and "mlp", other local lighting models; "envmap-sg" and "envmap", one map with
+            traced visibility from the beginning; "baked", no light: the colours of the photographs
+            are used as albedo. docs/guide/lights.md compares them.
+        varying: what changes between photographs: "none"; "exposure", a gain per channel; "light",
+            the light as well; "auto", exposure if it is seen to change.
 
     Raises:
-        UserError: minutes out of range, no such light, or varying light with a map from the
-            beginning.
+        UserError: minutes is out of range, there is no such light, or the light varies and is one
+            map from the beginning.
     """
     if not 0 < minutes < math.inf:
         raise UserError(f"minutes must be above 0, got {minutes:g}", "minutes")
@@ -112,8 +111,8 @@ def chosen(
 
 
 def with_field(cfg: TrainConfig, kind: FieldName) -> TrainConfig:
-    """The same with stages on such a field; only the first, a coarse one, is dense where the
-    others are sparse. Capacity is fixed where they are."""
+    """The same configuration with another field. With sparse fields, the first, coarse stage is
+    dense and capacity is fixed."""
     stages = [replace(s, field=kind) if isinstance(s, StageConfig) else s for s in cfg.stages]
     if kind == "sparse" and isinstance(stages[0], StageConfig):
         stages[0] = replace(stages[0], field="dense")
@@ -122,16 +121,16 @@ def with_field(cfg: TrainConfig, kind: FieldName) -> TrainConfig:
 
 
 def with_metal(cfg: TrainConfig, metal: Metal) -> TrainConfig:
-    """The same, with what is known of what is metal.
+    """The same configuration, given whether the object is all metal.
 
     Raises:
-        UserError: all is, and there is no stage that solves for the map that it mirrors.
+        UserError: it is, but no stage solves for an environment map.
     """
     if metal == "auto":
         return cfg
     if not any(isinstance(s, JointConfig) for s in cfg.stages):
         raise UserError(
-            f"metal={metal} is for light=hybrid, which finds what metal mirrors, got "
+            f"metal={metal} needs light=hybrid, which finds reflections in metal, got "
             f"{cfg.scene.light.kind}",
             *("metal", "light"),
         )

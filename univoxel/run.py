@@ -1,4 +1,4 @@
-"""The folder of a run: what data it was trained on, and whether it came out well."""
+"""The folder of a run: the data it was trained on, and the verdict on the result."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class Source:
 
     folder: Path
     downscale: int  # pixels of the files along a side of one that was trained on
-    allow_outside: bool  # as of `load_photos`
+    allow_outside: bool  # as in `load_photos`
 
 
 def kept_photos(run: Path, split: str) -> Path:
-    """The file of a run that keeps photographs of a split as they were shrunk or straightened."""
+    """The file of a run that stores the prepared photographs of a split."""
     return run / f"photographs_{split}.safetensors"
 
 
@@ -36,10 +36,11 @@ def trained_on(run: Path) -> Path:
 
 
 def photos_of(run: Path, data: Path | None = None, split: str = "test") -> Photos:
-    """Photographs at the size that a run was trained at; of another data set, if one is given.
+    """Photographs at the size that a run was trained at.
 
     Args:
-        split: "test", or "train" for those that were trained on.
+        data: another data set; None: the one that the run was trained on.
+        split: "test" or "train".
 
     Raises:
         DataError: the run or the photographs cannot be read.
@@ -60,7 +61,7 @@ WORLD = "world.json"  # in the folder of a run whose world is not that of its da
 
 
 def save_world(moved: np.ndarray | None, run: Path) -> None:
-    """Write how the world of the data's files was moved to that of the run, as of `Photos`.
+    """Write the transform from the world of the data's files to that of the run, as in `Photos`.
 
     Raises:
         OSError: it cannot be written.
@@ -71,7 +72,7 @@ def save_world(moved: np.ndarray | None, run: Path) -> None:
 
 
 def load_world(run: Path) -> np.ndarray | None:
-    """[3, 4], as of `Photos.moved`; None also of runs of earlier versions, which kept none.
+    """[3, 4], as in `Photos.moved`; None also of runs of earlier versions, which kept none.
 
     Raises:
         DataError: the file cannot be read.
@@ -84,7 +85,7 @@ def load_world(run: Path) -> np.ndarray | None:
     except (KeyError, TypeError, ValueError, OverflowError):
         moved = np.empty(0)
     if moved.shape != (3, 4) or not np.isfinite(moved).all():
-        raise DataError(f"{path}: expected from_data, a rotation and a translation, got none")
+        raise DataError(f"{path}: expected from_data, a rotation and a translation")
     return moved
 
 
@@ -92,7 +93,7 @@ def _source_of(run: Path) -> Source:
     """What photographs a run's config.json says that it was trained on."""
     path = run / "config.json"
     if not path.is_file():
-        raise DataError(f"{run}: expected the folder of a run, got no {path.name}")
+        raise DataError(f"{run}: expected the folder of a run, but it has no {path.name}")
     config = read_json(path)
     if not isinstance(config, dict):
         raise DataError(f"{path}: expected an object with the configuration, got {config!r:.80}")
@@ -111,7 +112,7 @@ def _source_of(run: Path) -> Source:
     )
 
 
-# Whether a run came out well, by evidence: good, usable, retake or unfinished.
+# The verdict on a run, from evidence: good, usable, retake or unfinished.
 
 
 FILE = "verdict.json"  # in the folder of a run
@@ -129,22 +130,22 @@ GOOD_RESIDUAL, POOR_RESIDUAL = 0.15, 0.8
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a verdict rests on; None: not measured."""
+    """The evidence for a verdict; None: not measured."""
 
     steps: Mapping[str, float]  # share made, by name of the stages that were cut
     stopped: bool = False  # by hand
     minutes: float | None = None  # in which all steps would have been made
     limit: float | None = None  # minutes; None: there was none
-    psnr: float | None = None  # dB, of held-out pixels
-    outline: float | None = None  # share of held-out pixels on the wrong side of the silhouette
+    psnr: float | None = None  # dB, of validation pixels
+    outline: float | None = None  # share of validation pixels on the wrong side of the silhouette
     hidden: float | None = None  # share of the surface that too few cameras see
     residual: float | None = None  # share of the surface that differs from its photographs
-    troubles: int = 0  # steps or stages that went wrong and were mended
+    troubles: int = 0  # steps or stages that went wrong and were repaired
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a run is worth, why, and what would help."""
+    """The quality of a run in a word, with reasons and remedies."""
 
     word: Word
     complete: bool  # whether all planned steps were made
@@ -154,16 +155,22 @@ class Verdict:
 
     @property
     def empty(self) -> bool:
-        """Whether a stage made no step at all: what it is for is missing."""
+        """Whether a stage made no step at all, so that its result is missing."""
         return any(made == 0 for made in self.evidence.steps.values())
 
-    def sentence(self) -> str:
-        """The verdict in a line."""
-        quality = "" if self.evidence.psnr is None else f"validation {self.evidence.psnr:.1f} dB"
+    def lines(self) -> list[str]:
+        """The verdict, and a line with the remedies, if there are any."""
+        psnr = self.evidence.psnr
+        quality = () if psnr is None else (f"validation PSNR {psnr:.1f} dB",)
         said = f"Result: {self.word}"
-        told = "; ".join(self.reasons) or quality
-        help_ = f". What helps: {'; or '.join(self.remedies)}" if self.remedies else ""
-        return f"{said}, {told}{help_}" if told else f"{said}{help_}"
+        if told := "; ".join(self.reasons or quality):
+            said += f", {told}"
+        remedies = "; or ".join(self.remedies)
+        return [said, f"To improve it: {remedies}"] if remedies else [said]
+
+    def sentence(self) -> str:
+        """The verdict and its remedies in one paragraph."""
+        return ". ".join(self.lines())
 
 
 def judge(evidence: Evidence) -> Verdict:
@@ -171,7 +178,7 @@ def judge(evidence: Evidence) -> Verdict:
     faults: list[tuple[bool, str, str]] = []  # whether it is poor, the reason, the remedy
 
     def check(value: float | None, good: float, poor: float, reason: str, remedy: str) -> None:
-        """Note a value that is not good; NaN is poor. Which way is better is told by the limits."""
+        """Note a value that is not good; NaN is poor. If good > poor, more is better."""
         if value is None:
             return
         sign = 1 if good > poor else -1
@@ -182,33 +189,33 @@ def judge(evidence: Evidence) -> Verdict:
         evidence.psnr,
         GOOD_DB,
         POOR_DB,
-        f"validation {{:.1f}} dB, where {GOOD_DB:g} and more are good",
-        "sharp photographs of one exposure, with the object still and the light unchanged",
+        f"validation PSNR {{:.1f}} dB ({GOOD_DB:g} or more is good)",
+        "photograph sharply, with one exposure, and move neither object nor light",
     )
     check(
         evidence.outline,
         GOOD_OUTLINE,
         POOR_OUTLINE,
-        "{:.0%} of the outline is not where the masks have it",
-        "better masks: look at them with `univoxel inspect`",
+        "{:.0%} of the outline differs from the masks",
+        "correct the masks",
     )
     check(
         evidence.hidden,
         GOOD_HIDDEN,
         POOR_HIDDEN,
         "{:.0%} of the surface is seen by too few cameras",
-        "more photographs: `univoxel report` shows from where",
+        "take more photographs (`univoxel report` shows from where)",
     )
     check(
         evidence.residual,
         GOOD_RESIDUAL,
         POOR_RESIDUAL,
         "{:.0%} of the surface differs visibly from its photographs",
-        "`--preset full`, if the object did not move and its masks are right",
+        "train with `--preset full`, if masks are right and the object did not move",
     )
     if evidence.troubles:
         times = "once" if evidence.troubles == 1 else f"{evidence.troubles} times"
-        faults.append((False, f"training met trouble {times} and went on", "another `--seed`"))
+        faults.append((False, f"training had to recover {times}", "try another `--seed`"))
     faults.sort(key=lambda found: not found[0])
     word: Word = "good" if not faults else "retake" if faults[0][0] else "usable"
     reasons = [reason for _, reason, _ in faults]
@@ -216,13 +223,15 @@ def judge(evidence: Evidence) -> Verdict:
     if evidence.steps:
         word = "unfinished"
         made = ", ".join(f"{share:.0%} for {name}" for name, share in evidence.steps.items())
-        why = "it was stopped" if evidence.stopped else "the time was up"
+        why = "it was stopped" if evidence.stopped else "the time limit was too short"
         reasons.insert(0, f"{why}: of the planned steps it made {made}")
         needed = None if evidence.minutes is None else math.ceil(evidence.minutes)
         if evidence.stopped or evidence.limit is None:
-            remedies.insert(0, "train it to the end")
+            remedies.insert(0, "resume the training with `--resume`")
         elif needed is not None:
-            remedies.insert(0, f"`--minutes {max(needed, math.floor(evidence.limit) + 1)}`")
+            remedies.insert(
+                0, f"train with `--minutes {max(needed, math.floor(evidence.limit) + 1)}`"
+            )
     remedies = list(dict.fromkeys(remedies))[:2]
     return Verdict(word, not evidence.steps, tuple(reasons), tuple(remedies), evidence)
 
@@ -243,8 +252,7 @@ def as_json(verdict: Verdict) -> dict[str, Any]:
 
 
 def load_verdict(run: Path) -> Verdict | None:
-    """The verdict on a run; None where there is none: it has not ended, or an older version trained
-    it."""
+    """The verdict on a run; None if training has not ended, or is older than version 0.3."""
     try:
         values = read_json(run / FILE)
         evidence = Evidence(**values["evidence"])

@@ -1,4 +1,4 @@
-"""A scene: field, heads and light; its file, what that holds, and reading it back."""
+"""A scene: field, networks and light; writing it to a file and reading it back."""
 
 from __future__ import annotations
 
@@ -41,53 +41,43 @@ class SceneConfig:
 
     channels: int = setting(16, "features per voxel", least=1)
     material_channels: int = setting(
-        8, "of them, that albedo and roughness are decoded from", least=1
+        8, "features that albedo and roughness are decoded from", least=1
     )
     hidden: int = setting(64, "width of the material and radiance heads", least=1)
-    mirror_levels: int = setting(
-        5, "of the table of mirrored directions, 29 degrees and finer", least=0, most=8
-    )
-    sky_nodes: int = setting(
-        512, "directions of the environment map; 0: the scene has none", least=0
-    )
+    mirror_levels: int = setting(5, "levels of the table of reflected directions", least=0, most=8)
+    sky_nodes: int = setting(512, "nodes of the environment map; 0: the scene has none", least=0)
     sky_rows: int = setting(
         0,
-        "rows of the map's texels, in runs of version 0.2 where polished things showed it more "
-        "sharply than its nodes do",
+        "rows of environment map texels; used by runs of version 0.2 only",
         least=0,
         most=MOST_ROWS,
     )
     mirrored: bool = setting(
-        True, "whether a local light gets a network for what is mirrored sharply"
+        True, "whether a local light has a network for sharp specular reflections"
     )
-    light: lights.LightConfig = setting(
-        lights.SGConfig(), "the light that photographs are rendered with, and its own sizes"
-    )
+    light: lights.LightConfig = setting(lights.SGConfig(), "lighting model with its own sizes")
     roughness: float | None = setting(
         None,
-        "of everything, where it is known and nothing is metal; None: both are learned",
+        "known roughness of an object without metal; None: roughness and metallic are learned",
         above=0,
         most=1,
     )
     turntable: Turntable | None = setting(
-        None, "about which the light turns with the camera; None: it stands still"
+        None, "axes about which the light turns with the camera; None: the light stands still"
     )
     flash: float | None = setting(
         None,
-        "distance of the object from a flash at the camera's lens, see Flash; None: there is none",
+        "distance between the object and a flash at the camera lens, see Flash; None: no flash",
         unit="world units",
         above=0,
     )
-    varying: Varying = setting("none", "what differs from photograph to photograph, see ViewLights")
-    codes: int = setting(8, "numbers that tell the light of a view, where that varies", least=1)
+    varying: Varying = setting("none", "what changes between photographs, see ViewLights")
+    codes: int = setting(8, "size of a view's appearance embedding", least=1)
     refined: bool = setting(
-        False,
-        "whether the photographs' cameras are learned too, see PoseSteps; training fills it in",
+        False, "whether camera poses are optimised, see PoseSteps; set by training"
     )
     views: tuple[str, ...] = setting(
-        (),
-        "names of the photographs, where something differs from one to another; training fills "
-        "them in",
+        (), "names of the photographs, if something changes between them; set by training"
     )
 
     def __post_init__(self) -> None:
@@ -96,27 +86,27 @@ class SceneConfig:
         check_fields(self, most, lambda x: x <= self.channels, "material_channels")
         if self.turntable is not None and not isinstance(self.light, lights.LocalLightConfig):
             raise ConfigError(
-                "SceneConfig: light that turns with the camera needs hybrid or a local light, sg, "
-                f"sh or mlp, got {self.light.kind}",
+                "SceneConfig: light that turns with the camera needs hybrid or a local lighting "
+                f"model (sg, sh or mlp), got {self.light.kind}",
                 "light_frame",
                 "light",
             )
         if self.turntable is not None and self.varying == "light":
             raise ConfigError(
-                "SceneConfig: light that turns with the camera cannot vary otherwise too; varying "
-                "exposure goes with it",
+                "SceneConfig: light that turns with the camera cannot vary as well; only "
+                "exposure can",
                 "light_frame",
                 "varying",
             )
         if self.varying == "light" and not isinstance(self.light, lights.LocalLightConfig):
             raise ConfigError(
-                "SceneConfig: varying light needs hybrid or a local light, sg, sh or mlp, got "
-                f"{self.light.kind}; varying exposure goes with every light"
+                "SceneConfig: varying light needs hybrid or a local lighting model (sg, sh or "
+                f"mlp), got {self.light.kind}; varying exposure works with all of them"
             )
 
 
 class Scene(nn.Module):
-    """Everything that is learned of an object and of the light it stood in."""
+    """All that is learned about an object and its light."""
 
     def __init__(self, cfg: SceneConfig, field: Field, inv_s: float = 1.0) -> None:
         super().__init__()
@@ -153,10 +143,10 @@ class Scene(nn.Module):
         self._held = False
 
     def coded(self, features: Tensor, view: Tensor | int | None = None) -> Tensor:
-        """Features [N, C] as the networks of light read them: [N, C + Z], with the view's code.
+        """Append the view's appearance embedding to features [N, C]: [N, C + Z].
 
         Args:
-            view: [N] int64 number of a photograph, or one for all; None: the light that is shown.
+            view: [N] int64 index of a photograph, or one for all; None: the chosen light.
         """
         code = None if self.views is None else self.views.code(view)
         if code is None:
@@ -178,17 +168,17 @@ class Scene(nn.Module):
         return replace(photos, cameras=self.poses.corrected(photos.cameras))
 
     def show_light_of(self, view: str | None) -> None:
-        """Choose the photograph, by name or number, whose light is shown; None: the mean of all.
+        """Choose the photograph, by name or number, whose light is used; None: the mean of all.
 
         Raises:
-            ValueError: no such photograph, or the scene has one light for all.
+            ValueError: there is no such photograph, or the scene has one light for all.
         """
         if self.views is not None:
             self.views.choose(view)
         elif view is not None:
             raise UserError(
-                f"light_of: all views of this run have one light, got {view!r}; it was trained "
-                "without varying",
+                f"light_of: expected a run trained with varying light, got {view!r} for a run in "
+                "which all views share one light",
                 "light_of",
                 "varying",
             )
@@ -210,7 +200,7 @@ class Scene(nn.Module):
     @contextmanager
     def surface_held(self) -> Iterator[None]:
         """A block in which `occluder` stays as it was first asked for, though the surface moves,
-        until `release_surface`: tracing anew in every step would cost more than the step."""
+        until `release_surface`: tracing again in every step would cost more than the step."""
         stale = self._traced is not None and not self._traced[1].holds(self.field.sdf)
         if stale and not self._held:
             self._traced = None
@@ -229,7 +219,7 @@ class Scene(nn.Module):
         return self.__dict__ | {"_traced": None, "_held": False}
 
     def environment(self) -> DistantLight | lights.EnvmapLight | lights.EnvmapSGLight | None:
-        """The one distant map that the scene stood in, where it has one; without gains."""
+        """The environment map that is the same for all photographs, if there is one; no gains."""
         if isinstance(self.light, lights.EnvmapLight | lights.EnvmapSGLight):
             return self.light
         change = self.views.sky_change() if self.views else None
@@ -291,16 +281,16 @@ def stored(scene: Scene, slim: bool = False, reach: float | None = None) -> dict
 def save_scene(
     scene: Scene, run: Path, state: dict[str, Any], slim: bool = False, reach: float | None = None
 ) -> Path:
-    """Write run/scene.safetensors whole or not at all; `state` (JSON) travels in its metadata.
+    """Write run/scene.safetensors atomically; `state` (JSON) is stored in its metadata.
 
     Args:
-        slim: for a scene that is done: the grids in half precision, and features only where rays
-            meet the surface; otherwise what is loaded equals what was saved, bit by bit.
-        reach: voxels from the surface, > 0, beyond which a slim file says of a node only on which
-            side it lies; SHELL for features and no limit for distances when left out.
+        slim: for a finished scene: store the grids in half precision, and features only where rays
+            meet the surface. Otherwise, loading gives back the same bits.
+        reach: narrow-band width in voxels, > 0: beyond it a slim file stores only the sign of a
+            node's distance; None: SHELL for features and no limit for distances.
 
     Raises:
-        FileError: names the file when it cannot be written; the one before stays.
+        FileError: the file cannot be written; the earlier one is unchanged.
     """
     tensors = stored(scene, slim, reach)
     meta = {
@@ -362,7 +352,7 @@ class State:
     took: tuple[float, ...] = ()
     stage_took: float = 0.0
     finished: bool = False
-    within: Within | None = None  # None: at the begin of a stage, or in one without rounds
+    within: Within | None = None  # None: at the start of a stage, or in one without rounds
     seconds: float = 0.0
     chosen: tuple[Choice, ...] = ()
     troubles: tuple[str, ...] = ()
@@ -388,23 +378,21 @@ class Description:
     def __post_init__(self) -> None:
         check_fields(self, "above 0", lambda x: 0 < x < math.inf, "inv_s")
         if (self.field == "hash") != (self.levels is not None):
-            raise ConfigError(
-                f"Description: levels must be those of a hash field, got {self.field}"
-            )
+            raise ConfigError(f"Description: only a hash field has levels, got {self.field}")
 
 
 def load_checkpoint(run: str | Path) -> tuple[Scene, dict[str, Any]]:
-    """The scene of a run, in evaluation mode, and the state it was saved with.
+    """The scene of a run, in evaluation mode, and the state that was saved with it.
 
-    Sizes that the file claims are compared with its tensors before memory is taken for them.
+    Sizes in the file are compared with its tensors before memory is allocated for them.
 
     Raises:
-        MissingFile: no checkpoint there.
-        DataError: one that is cut short, damaged, or of another version.
+        MissingFile: the run has no checkpoint.
+        DataError: the checkpoint is truncated, damaged or of another version.
     """
     path = Path(run) / FILE
     if not path.is_file():
-        raise MissingFile(f"no checkpoint in {run} (looked for {FILE}); run `univoxel train` first")
+        raise MissingFile(f"{run}: not a trained run (no {FILE}): run `univoxel train` first")
     meta, tensors = _read(path)
     state = meta.get("state", {})
     try:
@@ -414,14 +402,14 @@ def load_checkpoint(run: str | Path) -> tuple[Scene, dict[str, Any]]:
         if "field.place" in tensors:
             where = tensors.pop("field.place"), tensors.pop("field.inside")
             bricks = unpack_bricks(*where, about.grid.size)
-        with torch.device("meta"):  # sizes alone
+        with torch.device("meta"):  # sizes only
             _compare(_scene(about, bricks), tensors)
         scene = _scene(about, bricks)
         _unpack_(scene, tensors)
         scene.load_state_dict(tensors)
         return scene.eval(), state
     except (RuntimeError, KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        raise DataError(f"{path}: does not fit its own description: {error}") from error
+        raise DataError(f"{path}: the contents contradict the description: {error}") from error
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -431,12 +419,12 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
             meta = json.loads((file.metadata() or {}).get("univoxel", "{}"))
             tensors = {name: file.get_tensor(name) for name in file.keys()}
     except (SafetensorError, OSError, ValueError, RecursionError) as error:
-        raise DataError(f"{path}: damaged or cut short: {error}") from error
+        raise DataError(f"{path}: damaged or truncated: {error}") from error
     if not isinstance(meta, dict) or meta.get("format") != FORMAT:
         came = meta.get("format") if isinstance(meta, dict) else meta
         raise DataError(
-            f"{path}: expected checkpoint format {FORMAT}, got {came!r:.60}; "
-            "it was written by another version of univoxel"
+            f"{path}: expected checkpoint format {FORMAT}, got {came!r:.60}; another version of "
+            "univoxel wrote it"
         )
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not tensor.isfinite().all():
@@ -481,7 +469,7 @@ def _compare(scene: Scene, tensors: dict[str, Tensor]) -> None:
         parts["field.sdf"] = SDF
     names = {n for name in expected for n in parts.get(name, (name,))}
     if different := names ^ tensors.keys():
-        what = "is missing" if min(different) in names else "belongs to no part"
+        what = "is missing" if min(different) in names else "is unknown"
         raise ValueError(f"{min(different)} {what}")
     for name, value in expected.items():
         if name in parts:
@@ -489,9 +477,9 @@ def _compare(scene: Scene, tensors: dict[str, Tensor]) -> None:
             _compare_rows(name, value, rows, values)
         elif tensors[name].shape != value.shape:
             came = list(tensors[name].shape)
-            raise ValueError(f"{name} is expected as {list(value.shape)}, got {came}")
+            raise ValueError(f"expected {name} with shape {list(value.shape)}, got {came}")
         elif tensors[name].is_floating_point() != value.is_floating_point():
-            raise ValueError(f"{name} is expected as {value.dtype}, got {tensors[name].dtype}")
+            raise ValueError(f"expected {name} as {value.dtype}, got {tensors[name].dtype}")
 
 
 def _compare_rows(name: str, table: Tensor, rows: Tensor, values: Tensor) -> None:
@@ -500,13 +488,13 @@ def _compare_rows(name: str, table: Tensor, rows: Tensor, values: Tensor) -> Non
     count = table.numel() // math.prod(channels)
     if rows.dtype != torch.int32 or list(values.shape) != [*rows.shape, *channels]:
         raise ValueError(
-            f"{name} is expected as rows and their {channels} values, got {list(rows.shape)} "
+            f"expected {name} as rows with {channels} values, got {list(rows.shape)} "
             f"{rows.dtype} and {list(values.shape)}"
         )
     if count > ROWS_FOR_ONE * (len(rows) + ROWS_FOR_ONE):
-        raise ValueError(f"{name} is expected with {count} rows, got no more than {len(rows)}")
+        raise ValueError(f"expected {name} with {count} rows, got at most {len(rows)}")
     if len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < count:
-        raise ValueError(f"{name} is expected with rows below {count}, got others")
+        raise ValueError(f"expected {name} with rows below {count}, got larger ones")
 
 
 def _unpack_(scene: Scene, tensors: dict[str, Tensor]) -> None:

@@ -1,5 +1,5 @@
-"""Directions: point sets on the sphere, frames around a normal, the lat-long mapping, harmonics;
-and the sides of an object, in words."""
+"""Directions: point sets on the sphere, frames around a normal, lat-long mapping, harmonics; and
+names for the sides of an object."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 # Of an azimuth from the front, counter-clockwise seen from above: eighths of a turn. Left and right
-# are those of whoever stands in front.
+# are those of whoever is in front.
 SIDES = (
     *("front", "front right", "right", "back right"),
     *("back", "back left", "left", "front left"),
@@ -206,8 +206,8 @@ def gaps(
         low = azimuth[begin]
         side = side_of(low + steps[k] / 2)
         told.append(
-            f"no photograph from the {side}, {steps[k]:.0f} degrees between {names[begin]} and "
-            f"{names[end]}"
+            f"no photograph from the {side}: there is a gap of {steps[k]:.0f} degrees between "
+            f"{names[begin]} and {names[end]}"
         )
     if height.max() < HIGH:
         told.append(f"no photograph from above {height.max():.0f} degrees")

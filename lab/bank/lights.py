@@ -50,7 +50,7 @@ def light(kind: Kind, random: np.random.Generator) -> Radiance:
 
 
 def tabulated(radiance: Radiance, poles: bool = False) -> np.ndarray:
-    """A map [H, 2H, 3] float32; `poles` as of `lab.stress.scenes.environment`."""
+    """A map [H, 2H, 3] float32; `poles` as in `lab.stress.scenes.environment`."""
     return radiance(scenes.directions_of_map(MAP_HEIGHT, poles)).astype(np.float32)
 
 

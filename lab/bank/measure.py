@@ -29,7 +29,7 @@ from univoxel.scene import Scene, load_checkpoint
 MEASURES = {
     "nvs_psnr": ("novel views, dB", 2),
     "albedo_psnr_fg": ("albedo in the mask, dB", 2),
-    "albedo_psnr_3ch": ("albedo, whole picture, dB", 2),
+    "albedo_psnr_3ch": ("albedo, whole image, dB", 2),
     "roughness_mse": ("roughness MSE", 4),
     "relit_psnr": ("relit, dB", 2),
     "normal_mae_deg": ("normals, degrees", 2),
@@ -105,7 +105,7 @@ def materials_of(path: Path, metallic: Tensor | None, roughness: Tensor) -> np.n
     """Found and true metal, found and true roughness, and the part: [5, N] of a view's object.
 
     Args:
-        path: truth of the view, as of `lab.stress.scenes.truth_of_view`.
+        path: truth of the view, as in `lab.stress.scenes.truth_of_view`.
         metallic, roughness: [H * W] as recovered; metallic may be missing, where nothing is metal.
     """
     with np.load(path) as arrays:
@@ -130,7 +130,7 @@ def pieces(metal: np.ndarray, true: np.ndarray, part: np.ndarray) -> tuple[int, 
 
 
 def share(which: np.ndarray, among: np.ndarray) -> float | None:
-    """Of some pixels; None where there are too few."""
+    """Of some pixels; None if there are too few."""
     return float(which[among].mean()) if among.mean() > LEAST else None
 
 
@@ -214,14 +214,14 @@ def markdown(halves: Mapping[str, dict[str, Any]]) -> str:
     for key, title in SHARES.items():
         lines.append(row(f"share of matte surface {title}", [h["matte"][key] for h in every], 3))
     for measure, key in RANKS.items():
-        lines += ["", head.replace("| |", f"| doubt of {key} |", 1)]
+        lines += ["", head.replace("| |", f"| uncertainty of {key} |", 1)]
         ranks = [h["ranks"][measure] for h in every]
         lines.append(row("rank correlation with the error, mean of scenes", ranks))
         for k in range(BINS):
             cells = [h["calibration"][key][k] for h in every]
             shown = [f"{_text(n, 2)}: {_text(e, 3)}" for n, _, e in cells]
             lines.append(f"| {k / BINS:.1f} to {(k + 1) / BINS:.1f} | {' | '.join(shown)} |")
-    lines += ["", "Of doubt: share of the pixels, and their mean error."]
+    lines += ["", "By uncertainty: share of the pixels, and their mean error."]
     return "\n".join(lines) + "\n"
 
 

@@ -130,7 +130,7 @@ def render_scene(seed: int, index: int, folder: Path) -> Path:
     """Write the data set of a scene, unless it is there.
 
     Raises:
-        UserError, MissingExtra, ProcessFailed, OSError: as of `lab.stress.render.render`.
+        UserError, MissingExtra, ProcessFailed, OSError: as in `lab.stress.render.render`.
     """
     return render.render_in(__name__, identity(seed, index), folder)
 

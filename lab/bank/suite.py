@@ -47,8 +47,8 @@ def bank(
         half: of the scenes; both when None.
         count: of the scenes of both halves, the first, >= 1.
         seed: of what the scenes are; those of another seed are other scenes.
-        label: of trainings that are kept beside others, such as of another version.
-        preset, changes: of the trainings, as of train.
+        label: of trainings that are kept beside others, such as in another version.
+        preset, changes: of the trainings, as in train.
         jobs: trainings at once.
 
     Returns:
@@ -79,7 +79,7 @@ def bank(
         found = {folder: load_outcome(runs / folder.name / label) for folder in folders}
         outcomes = {folder: outcome for folder, outcome in found.items() if outcome is not None}
         if not outcomes:
-            raise UserError(f"{runs}: expected trainings named {label}, got none: train first")
+            raise UserError(f"{runs}: expected trainings named {label}, found none: train first")
     else:
         setting = Setting(label, preset, changes=tuple(changes))
         pairs = [(folder, setting) for folder in folders]
@@ -98,7 +98,7 @@ def _rendered(seed: int, index: int, folder: Path) -> None:
 
 
 def _judged(data: Path, kept: Path, outcome: Outcome) -> dict[str, Any] | None:
-    """What a training decided, kept beside its result; None where it failed."""
+    """What a training decided, kept beside its result; None if it failed."""
     if outcome.error:
         return None
     path = kept / JUDGED

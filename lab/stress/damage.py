@@ -70,7 +70,7 @@ def damaged(
     photos = photos.of(torch.arange(damage.views))
     if damage.light:
         if second is None:
-            raise ValueError("damaged: light above 0 needs a scene in a second light")
+            raise ValueError("damaged: light above 0 needs a scene under a second light")
         share = torch.from_numpy(damage.light * random.uniform(size=damage.views)).float()
         other = load_photos(second, "train").color[: damage.views]
         photos = replace(photos, color=torch.lerp(photos.color, other, share[:, None, None, None]))
@@ -119,7 +119,7 @@ def exposures(views: int, stops: float, random: np.random.Generator) -> Tensor:
 
 
 def masked(photos: Photos, view: int, dilation: float, turn: float = 0.0) -> tuple[Tensor, Tensor]:
-    """Linear colour [H, W, 3] before what stands behind the object, and a mask [H, W] too large.
+    """Linear colour [H, W, 3] before what is behind the object, and a mask [H, W] too large.
 
     The background is envmaps/train.exr, far away, turned about +Z by so many radians. A dilated
     pixel has the largest coverage within so many pixels.

@@ -84,7 +84,7 @@ def render_in(module: str, identity: str, folder: Path) -> Path:
         identity: what folder/scene.json says, by which the scene is known.
 
     Raises:
-        UserError, MissingExtra, ProcessFailed, OSError: as of `render`.
+        UserError, MissingExtra, ProcessFailed, OSError: as in `render`.
     """
     if holds(identity, folder):
         return folder
@@ -128,7 +128,7 @@ def holds(identity: str, folder: Path) -> bool:
         return False
     if path.read_text(encoding="utf-8") != identity:
         raise UserError(
-            f"{path}: is of another scene: remove {folder}, or choose another out", "out"
+            f"{path}: made for another scene: remove {folder}, or choose another out", "out"
         )
     return True
 

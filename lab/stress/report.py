@@ -46,7 +46,7 @@ class Cell:
         return [v for v in found if v is not None and math.isfinite(v)]
 
     def mean(self, key: str) -> float | None:
-        """None where a seed failed or gave no finite number: half an answer would flatter."""
+        """None if a seed failed or gave no finite number: half an answer would flatter."""
         found = self.values(key)
         return fmean(found) if found and len(found) == len(self.outcomes) else None
 
@@ -140,10 +140,10 @@ def markdown(cells: Sequence[Cell]) -> str:
     axes, lights = _axes(cells), _lights(cells)
     made, said, found = plots.machine(), counts(cells), breaks(cells)
     lines = [
-        "# Where it breaks\n",
+        "# Breaking points\n",
         f"{said['trainings']} trainings on {made['threads']} threads of {made['processor']}: "
         f"{said['refused']} refused, {said['not finite']} not finite, {said['crashed']} crashed.\n",
-        f"Breaking point: where the relit PSNR has fallen {DROP:g} dB below the reference.\n",
+        f"Breaking point: the level at which the relit PSNR is {DROP:g} dB below the reference.\n",
         f"| axis | severities | {' | '.join(lights)} |",
         "|---|---|" + "---|" * len(lights),
     ]

@@ -21,7 +21,7 @@ DEPTH = 0.3  # radius of what is kept of the ground, the same
 def shifted(photos: Photos, percent: float, random: np.random.Generator) -> Photos:
     """Photographs of which some are taken beside the object: their edge cuts it.
 
-    What a shifted picture shows anew is empty.
+    What a shifted picture shows again is empty.
     """
     color, alpha, centre = photos.color.clone(), photos.alpha.clone(), photos.cameras.centre.clone()
     for view in _some(len(photos), SHIFTED * percent, random):

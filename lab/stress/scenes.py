@@ -107,7 +107,7 @@ def environment(spec: Spec, name: str, poles: bool = False) -> np.ndarray:
 
 
 def directions_of_map(height: int, poles: bool) -> np.ndarray:
-    """Unit directions [H, 2H, 3] of a map's texels; `poles` as of `environment`."""
+    """Unit directions [H, 2H, 3] of a map's texels; `poles` as in `environment`."""
     if not poles:
         return latlong_directions(height).double().numpy()
     theta = math.pi / 2 - math.pi * np.arange(height) / (height - 1)
@@ -173,7 +173,7 @@ def surface_points(parts: Sequence[Part], count: int = POINTS) -> np.ndarray:
     u, v = torch.where(flip, 1 - u, u), torch.where(flip, 1 - v, v)
     a, b, c = corners[face].unbind(1)
     points = a + u[:, None] * (b - a) + v[:, None] * (c - a)
-    # Parts stand in one another: what no ray leaves is inside
+    # Parts are in one another: what no ray leaves is inside
     scene = VisibilityScene(mesh["vertices"], mesh["faces"])
     start = points + 1e-3 * torch.nn.functional.normalize(normal[face], dim=1)
     seen = torch.zeros(len(points), dtype=torch.bool)

@@ -53,13 +53,13 @@ def stress(
 
     Args:
         out: out/scenes keeps what was rendered, out/data the photographs made of it, out/runs every
-            training: a later call goes on.
+            training: a later call continues.
         only: names of axes; all when empty.
         light: models of light; when empty SHOWN, or hybrid alone where it shall be quick.
         seeds: of the training and of what is random in the photographs, >= 1; when None 3, or 1.
         quick: fewer severities.
         changes: FIELD=VALUE of the configuration, for all.
-        jobs, scheduler: trainings at once here, or who else trains; as of runner.run_pairs.
+        jobs, scheduler: trainings at once here, or who else trains; as in runner.run_pairs.
 
     Returns:
         out/stress.md. A training that failed is a result.
@@ -181,7 +181,7 @@ def _damaged(
     path = place / IDENTITY
     if path.exists():
         if path.read_text(encoding="utf-8") != identity:
-            raise UserError(f"{path}: is of other photographs: choose another out", "out")
+            raise UserError(f"{path}: made from other photographs: choose another out", "out")
         return place
     damaged(scene, place, damage, seed, second)
     path.write_text(identity, encoding="utf-8")

@@ -1,3 +1,3 @@
-"""What tests of the laboratory share with those of the package."""
+"""What tests of the experiments share with those of the package."""
 
 from tiny import tiny  # noqa: F401

@@ -104,7 +104,7 @@ def test_a_killed_training_starts_anew(out, tmp_path, monkeypatch):
     folder = tmp_path / "ball" / "small"
     shutil.copytree(out / "ball" / "small", folder)
     (folder / "result.json").unlink()
-    (folder / "run" / FILE).write_bytes(b"cut short")
+    (folder / "run" / FILE).write_bytes(b"truncated")
     begun = []
 
     def train(config):
@@ -160,14 +160,14 @@ def test_mistakes_are_found_before_anything_is_trained(data, tmp_path, trained):
         with pytest.raises(error, match=match):
             runner.run(scenes, settings, out, samples)
 
-    refused(ValueError, "expected scenes in folders of different names", [data, other])
-    refused(ValueError, "expected a scene, a folder of photographs, or more; got none", [])
+    refused(ValueError, "expected scene folders with different names", [data, other])
+    refused(ValueError, "expected at least one scene", [])
     refused(DataError, "transforms_test", [other])
     refused(
-        ValueError, r"settings of different names, got \['small', 'small'\]", [data], [SMALL] * 2
+        ValueError, r"settings with different names, got \['small', 'small'\]", [data], [SMALL] * 2
     )
     escaping = dataclasses.replace(SMALL, name="../up")
-    refused(ValueError, r"settings of different names, got \['../up'\]", settings=[escaping])
+    refused(ValueError, r"settings with different names, got \['../up'\]", settings=[escaping])
     refused(ValueError, "samples must be at least 1, got 0", samples=0)
     unknown = dataclasses.replace(SMALL, changes=("seed=x",))
     refused(ValueError, "changes=seed=x: expected a int", settings=[unknown])
@@ -177,13 +177,13 @@ def test_mistakes_are_found_before_anything_is_trained(data, tmp_path, trained):
 
 def test_scenes_with_settings_of_their_own(data, tmp_path, trained):
     other = tmp_path / "other"
-    other.mkdir()  # cannot be read: its process says so, the rest goes on
+    other.mkdir()  # cannot be read: its process says so, the rest continues
     twice = dataclasses.replace(SMALL, name="twice")
     pairs = [(data, SMALL), (other, twice), (data, twice)]
     found = runner.run_pairs(pairs, tmp_path / "out", samples=1)
     assert [(o.scene, o.setting) for o in found] == [(d.name, s.name) for d, s in pairs]
     assert trained == ["small", "twice", "twice"]
-    with pytest.raises(ValueError, match="settings of different names, got"):
+    with pytest.raises(ValueError, match="settings with different names, got"):
         runner.run_pairs([(data, SMALL), (data, SMALL)], tmp_path / "out", samples=1)
 
 

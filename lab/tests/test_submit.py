@@ -66,7 +66,7 @@ def test_a_submission(orb, tmp_path, capsys):
         assert picture(view["output_image"]).shape == (SIZE, SIZE, 3)
         assert picture(material["output_image"]).shape == (SIZE, SIZE, 3)
         normal = picture(geometry["output_normal"])
-        # The middle of a ball faces its camera. Its silhouette alone has been trained on so far
+        # The middle of a ball faces its camera. Its silhouette only has been trained on so far
         x, y, z = normal[SIZE // 2 - 32 : SIZE // 2 + 32, SIZE // 2 - 32 : SIZE // 2 + 32].mean(
             (0, 1)
         )
@@ -89,7 +89,7 @@ def test_each_view_is_in_its_own_light(orb, tmp_path):
 
 
 def test_runs_and_arguments_that_cannot_be_used(orb, tmp_path):
-    with pytest.raises(ExistingFile, match="is there already: choose another out"):
+    with pytest.raises(ExistingFile, match="exists already: choose another out"):
         submit(orb / "run", tmp_path)
     with pytest.raises(UserError, match="expected samples >= 1 and bounces >= 0, got 0 and 2"):
         submit(orb / "run", tmp_path / "out", samples=0, bounces=2)

@@ -2,9 +2,9 @@
 
 python scripts/docs [--write] [--release]
 
-Without --write nothing is changed, every difference is told, and the exit code is 1 if there is
-one. With --write generated blocks are filled anew; what is left to mend by hand is told. With
---release figures of several versions are a fault, too: `python benchmarks/figures.py` makes them.
+Without --write, nothing is changed: faults are printed, and the exit code is 1 if there are any.
+With --write, generated blocks are refilled, and the other faults are printed. With --release,
+figures of several versions are a fault too: `python benchmarks/figures.py` measures them again.
 """
 
 from __future__ import annotations
@@ -20,16 +20,18 @@ import doc_blocks  # noqa: E402
 import doc_names  # noqa: E402
 import doc_prose  # noqa: E402
 import doc_truth  # noqa: E402
+import doc_words  # noqa: E402
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description="check the documentation, or bring it up to date")
-    parser.add_argument("--write", action="store_true", help="fill the generated blocks anew")
+    parser.add_argument("--write", action="store_true", help="refill the generated blocks")
     parser.add_argument("--release", action="store_true", help="figures must be of one version")
     options = parser.parse_args()
     faults = doc_blocks.update(ROOT, write=options.write)
     faults += doc_blocks.unused(ROOT) + doc_prose.faults(ROOT)
     faults += doc_names.faults(ROOT) + doc_truth.faults(ROOT)
+    faults += doc_words.faults(ROOT)
     if options.release:
         faults += doc_blocks.several_versions(ROOT)
     for fault in faults:

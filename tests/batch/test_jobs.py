@@ -125,7 +125,7 @@ def test_a_mistake_is_not_tried_again_and_is_named(tmp_path):
     assert (tmp_path / "n").read_text() == "x"
     assert job.record()["errors"] == ended.errors
     left = saying(tmp_path, "nothing", "pass")
-    assert "ended well and left no" in run_job(left).errors["say"]
+    assert "ended without an error, but " in run_job(left).errors["say"]
     quiet = saying(tmp_path, "quiet", "import os; os._exit(3)")
     assert run_job(quiet).errors["say"] == "ended with exit code 3"
 
@@ -276,7 +276,7 @@ def test_a_scheduler_that_is_gone_is_said_and_its_work_ends(tmp_path):
             running.kill()
 
         threading.Thread(target=kill).start()
-        with pytest.raises(ProcessFailed, match="scheduler is gone: the same command goes on"):
+        with pytest.raises(ProcessFailed, match="scheduler was lost: run the same command again"):
             list(run_jobs(client, [job], 1))
         wait_for(lambda: not alive(begun(tmp_path, "mug")[0]))
     last = counting(tmp_path, "mug", last=int((tmp_path / "mug" / "at").read_text()) + 2)
@@ -291,7 +291,7 @@ def test_a_worker_without_the_package_is_named(tmp_path):
 
     with connect(1) as client, pytest.MonkeyPatch.context() as patch:
         patch.setattr("univoxel.batch.jobs.run_on_worker", run_on_worker)
-        with pytest.raises(ProcessFailed, match="a worker has another univoxel than this, or none"):
+        with pytest.raises(ProcessFailed, match="a worker has no univoxel, or another version"):
             list(run_jobs(client, [counting(tmp_path, "mug")], 1))
 
 

@@ -117,7 +117,7 @@ def test_the_time_is_told_once_it_is_measured(monkeypatch, caplog):
     assert caplog.messages == ["masks: from the network isnet-general-use, of 179 MB"]
     for _ in range(2):
         assert torch.equal(masked(photograph()), photograph()[..., 0] / 255)
-    assert caplog.messages[1:] == ["masks: 5.1 s a photograph, about 5 min for 60"]
+    assert caplog.messages[1:] == ["masks: 5.1 s per photograph, about 5 min for 60"]
 
 
 def test_rembg_goes_first(home, monkeypatch, caplog):
@@ -129,7 +129,7 @@ def test_rembg_goes_first(home, monkeypatch, caplog):
     monkeypatch.setitem(sys.modules, "rembg", made)
     mask = module.mask_network()(photograph())
     torch.testing.assert_close(mask, photograph()[..., 0].float() / 255)
-    assert caplog.messages == ["u2netp: weights of 4.7 MB are fetched once"]
+    assert caplog.messages == ["u2netp: weights of 4.7 MB"]
     (home / "u2net.onnx").touch()
     assert not module.mask_network("u2net")(photograph()).any()
     assert len(caplog.messages) == 1

@@ -260,9 +260,9 @@ def test_a_missing_reader_is_named_before_reading(tmp_path, monkeypatch):
 def test_broken_files_are_one_line(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     path.write_bytes(b"no picture at all" * 100)
-    with pytest.raises(DataError, match=f"a{suffix}: expected a photograph"):
+    with pytest.raises(DataError, match=f"a{suffix}: this photograph could not be read"):
         describe(path)
-    with pytest.raises(DataError, match=f"a{suffix}: expected a photograph"):
+    with pytest.raises(DataError, match=f"a{suffix}: this photograph could not be read"):
         read_upright(path)
 
 
@@ -276,7 +276,7 @@ def test_a_cut_off_photograph_is_told_when_it_is_read(tmp_path):
     assert unread == []
     found = dict(write_pictures(capture, Folders(tmp_path / "work"), 32))
     assert found[0] is None
-    assert "b.jpg: expected a photograph" in str(found[1])
+    assert "b.jpg: this photograph could not be read" in str(found[1])
     assert [p.name for p in (tmp_path / "work/pictures/0").iterdir()] == ["00000.jpg"]
 
 
@@ -326,7 +326,7 @@ def test_masks_that_do_not_fit_are_refused(tmp_path):
 
 def test_one_photograph_is_too_few(tmp_path):
     quarters().save(tmp_path / "a.jpg")
-    with pytest.raises(DataError, match="two photographs at least, could read 1"):
+    with pytest.raises(DataError, match="at least two photographs, could read 1"):
         gather([tmp_path / "a.jpg"], None)
 
 
@@ -341,5 +341,5 @@ def test_only_formats_of_photographs_are_opened(tmp_path, monkeypatch):
 
     monkeypatch.setattr("subprocess.Popen", started)
     for read in (describe, read_upright):
-        with pytest.raises(DataError, match=r"a\.jpg: expected a photograph, could not read it"):
+        with pytest.raises(DataError, match=r"a\.jpg: this photograph could not be read"):
             read(path)

@@ -154,7 +154,7 @@ def test_what_is_left_out_is_named(scene):
     assert f"{VIEWS + 1} photographs of 2 cameras (2 zoom settings)" in said[0]
     assert "2 could not be read: broken.jpg, notes.txt" in said[0]
     assert any(f"{VIEWS} of {VIEWS + 1} placed" in line for line in said)
-    assert any("white.jpg (nothing in it to hold on to)" in line for line in said)
+    assert any("white.jpg (no features in it that can be matched)" in line for line in said)
     report = json.loads((out / "poses.json").read_text())
     rows = {row["name"]: row for row in report["photographs"]}
     assert rows["white.jpg"]["written"] == ""
@@ -297,7 +297,7 @@ def turntable(tmp_path_factory) -> Path:
 
 
 def test_a_turntable_is_recognised_before_mapping(turntable, tmp_path):
-    with pytest.raises(DataError, match=r"background stands still in \d+ of \d+ pairs.*masks=DIR"):
+    with pytest.raises(DataError, match=r"background is static in \d+ of \d+ pairs.*masks=DIR"):
         poses(turntable, tmp_path / "out", config=SMALL)
     assert not (tmp_path / "out/sfm/models").exists()
     assert not (tmp_path / "out/images").exists()
@@ -329,7 +329,7 @@ def test_too_few_placed_is_one_line(photographs, tmp_path):
         shutil.copy(photographs / f"IMG {v:02d}.jpg", folder)
     for k in range(4):
         Image.new("RGB", (WIDTH, HEIGHT), (60 * k, 0, 0)).save(folder / f"plain{k}.png")
-    with pytest.raises(DataError, match=r"only \d of 6 photographs could be placed: .*plain0.png"):
+    with pytest.raises(DataError, match=r"only \d of 6 photographs were registered .*plain0.png"):
         poses(folder, tmp_path / "out", config=SMALL)
     assert not (tmp_path / "out/images").exists()
 
@@ -337,7 +337,7 @@ def test_too_few_placed_is_one_line(photographs, tmp_path):
 def test_what_is_no_folder_of_photographs_is_one_line(tmp_path):
     with pytest.raises(DataError, match="expected a folder of photographs or a video"):
         poses(tmp_path / "none", tmp_path / "out")
-    with pytest.raises(DataError, match="every is for videos"):
+    with pytest.raises(DataError, match="every applies to videos"):
         poses(tmp_path, tmp_path / "out", every=1.0)
     for name in "ab":
         Image.new("RGB", (64, 48)).save(tmp_path / f"{name}.jpg")

@@ -219,9 +219,9 @@ def test_lists_of_other_files_are_no_videos(film, tmp_path, text):
     (tmp_path / "secret.mp4").write_bytes(film.read_bytes())
     path = tmp_path / "list.mp4"
     path.write_text(text.format("secret.mp4"))
-    with pytest.raises(DataError, match=r"list\.mp4: expected a video, could not read it"):
+    with pytest.raises(DataError, match=r"list\.mp4: this video could not be read"):
         write_frames(path, tmp_path / "frames")
-    with pytest.raises(DataError, match=r"list\.mp4: expected a video, could not read it"):
+    with pytest.raises(DataError, match=r"list\.mp4: this video could not be read"):
         write_frames(path, tmp_path / "frames", every=0.5)
 
 

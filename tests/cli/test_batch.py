@@ -182,8 +182,8 @@ def test_a_scene_that_fails_takes_no_other_with_it(scenes, tmp_path, monkeypatch
     given = [*map(str, (broken, full, scenes[1])), "--out", str(out), "--jobs", "2"]
     assert main(["batch", *given, *options]) == 2
     captured = capsys.readouterr()
-    assert captured.err.splitlines()[-1] == (
-        "univoxel batch: 2 of 3 scenes failed (broken, full): the same command tries them again"
+    assert captured.err.splitlines()[-1].startswith(
+        "univoxel batch: 2 of 3 scenes failed (broken, full): run the same"
     )
     lines = captured.out.splitlines()
     assert [line for line in lines if line.startswith("broken: failed in train: univoxel train: ")]
@@ -298,19 +298,19 @@ def test_mistakes_are_found_before_anything_is_begun(scenes, tmp_path, monkeypat
             run_batch(given, tmp_path / "out", **options)
         assert not (tmp_path / "out").exists()
 
-    refused(UserError, "expected a scene, a folder of photographs, or more; got none", [])
+    refused(UserError, "expected at least one scene", [])
     refused(UserError, "nothing: expected a scene, got nothing there", [tmp_path / "nothing"])
     other = tmp_path / "b" / "ball"
     other.mkdir(parents=True)
-    refused(UserError, "folders of different names, got .*ball and .*ball", [scenes[0], other])
+    refused(UserError, "folders with different names, got .*ball and .*ball", [scenes[0], other])
     (tmp_path / "logs").mkdir()
     refused(UserError, "logs: expected another name than 'logs'", [tmp_path / "logs"])
     for name in ("jobs", "threads", "tries"):
         refused(UserError, f"{name} must be at least 1, got 0", **{name: 0})
     for field, value, match in (
         ("samples", 0, "samples must be at least 1, got 0"),
-        ("steps", (), "steps must be of poses, masks, .*, got none"),
-        ("steps", ("fly",), "steps must be of .*, got fly"),
+        ("steps", (), "steps must be among poses, masks, .*, got none"),
+        ("steps", ("fly",), "steps must be among .*, got fly"),
         ("changes", ("seed=x",), "changes=seed=x: expected a int"),
         ("config", tmp_path / "none.json", "got both: .*none.json says them"),
     ):

@@ -259,7 +259,7 @@ def steps(monkeypatch, tmp_path) -> list[tuple]:
 
 
 def no_network(*_):
-    raise MissingExtra("masks from a network need rembg: pip install 'univoxel[masks]'")
+    raise MissingExtra("making masks with a network needs rembg: pip install 'univoxel[masks]'")
 
 
 def red_is_the_object(*_):
@@ -287,7 +287,7 @@ def test_masks_come_from_a_network_or_else_from_depth(
     with caplog.at_level("INFO"):
         task.capture(pictures, tmp_path / "mug")
     assert steps[1] == ("cutout", tmp_path / "mug/scene", "rembg" if there else "none")
-    assert ("depth alone tells the object" in caplog.text) != there
+    assert ("the object is found by depth only" in caplog.text) != there
 
 
 def test_masks_of_ones_own_go_on(steps, pictures, tmp_path):
@@ -337,7 +337,7 @@ def test_another_box_makes_other_masks(steps, pictures, tmp_path, monkeypatch):
     with pytest.raises(ExistingFile, match=said):
         task.find_data(pictures, out, masks="none", box=box)
     scene = task.SCENE
-    with pytest.raises(UserError, match="brings masks, which are trained on as they are: with a"):
+    with pytest.raises(UserError, match="has masks, which training uses unchanged: with a"):
         task.find_data(scene, tmp_path / "other", box=box)
 
 
@@ -367,7 +367,7 @@ def test_the_first_steps_alone(steps, pictures, tmp_path):
     assert [name for name, *_ in steps] == ["poses", "cutout"]
     assert task.capture(pictures, out, masks="none").page.exists()  # goes on with them
     assert [name for name, *_ in steps] == ["poses", "cutout", "train"]
-    with pytest.raises(UserError, match="is a trained run: there are cameras and masks"):
+    with pytest.raises(UserError, match="is a trained run with cameras and masks"):
         task.find_data(out / "run", tmp_path / "other")
 
 
@@ -388,7 +388,7 @@ def test_a_capture_of_version_0_2_is_gone_on_with(steps, pictures, tmp_path):
 
 
 def still(photographs, out, masks=None, config=None):
-    raise StillBackground("the background stands still in 9 of 10 pairs")
+    raise StillBackground("the background is static in 9 of 10 pairs")
 
 
 def test_a_turntable_gets_masks_first(steps, pictures, tmp_path, monkeypatch, caplog):
@@ -411,7 +411,7 @@ def test_a_turntable_gets_masks_first(steps, pictures, tmp_path, monkeypatch, ca
     ]
     with pytest.raises(ExistingFile, match="cameras found with masks of network=u2netp: choose"):
         task.capture(pictures, out, network="u2net")
-    assert "s a photograph, about 10 s for 3" in caplog.text
+    assert "s per photograph, about 10 s for 3" in caplog.text
     for v in range(3):
         mask = np.asarray(Image.open(out / "masks" / f"{v}.png"))
         assert (mask == np.asarray(Image.open(pictures / f"{v}.png"))[..., 0]).all()

@@ -73,7 +73,7 @@ def test_what_is_written_can_be_trained_on(tmp_path, caplog, by_brightness):
         torch.testing.assert_close(cut.cameras.camera_to_world, source.cameras.camera_to_world)
         for view in range(count):  # each mask with its photograph
             assert iou(cut.picture(view)[1], photograph(source.cameras, view)[1]) > 0.9
-    with pytest.raises(FileExistsError, match="cut is there already: choose another out"):
+    with pytest.raises(FileExistsError, match="cut exists already: choose another out"):
         task.cutout(data, out)
 
 
@@ -118,7 +118,7 @@ def test_masks_of_a_folder_are_repaired(tmp_path, with_masks, caplog):
     assert task.cutout(data, out, folder) == out
     told = f"{VIEWS - 2} of {VIEWS} agree with the object's silhouette"
     assert told in caplog.text
-    assert "1 keep something beside the object (r_5), 1 miss a part (r_2): repaired" in caplog.text
+    assert "1 include something beside the object (r_5), 1 miss a part (r_2)" in caplog.text
     cut = load_photos(out)
     for view, mask in enumerate(true):
         found = cut.picture(view)[1]
@@ -138,7 +138,7 @@ def test_masks_that_are_mostly_wrong_stay(tmp_path, with_masks, caplog):
     task.cutout(data, out, folder)
     said = [r for r in caplog.records if r.levelno == logging.WARNING]
     assert len(said) == 1
-    assert "none is repaired" in said[0].getMessage()
+    assert "none is corrected" in said[0].getMessage()
     assert "look at masks.html" in said[0].getMessage()
     cut = load_photos(out)
     for view, mask in enumerate(masks):
@@ -152,7 +152,7 @@ def test_few_masks_stay_as_they_are(tmp_path, caplog):
     masks = [photos.picture(view)[1] for view in range(4)]
     folder = write_masks(tmp_path / "masks", masks, photos.names)
     task.cutout(data, tmp_path / "cut", folder)
-    assert "to check them needs 12 photographs, there are 4" in caplog.text
+    assert "that needs 12 photographs, there are 4" in caplog.text
     masks[1][:] = 0
     write_masks(folder, masks, photos.names)
     with pytest.raises(DataError, match="the mask of r_1 shows nothing"):
@@ -203,7 +203,7 @@ def test_what_stands_out_in_depth(tmp_path, room, caplog):
     caplog.set_level("INFO", "univoxel")
     data, true = room
     cut = load_photos(task.cutout(data, tmp_path / "cut", "none"))
-    assert "stands out in depth" in caplog.text
+    assert "masks from depth" in caplog.text
     agreed = [iou(cut.picture(view)[1], mask) for view, mask in enumerate(true)]
     assert np.mean(agreed) > 0.95
     assert min(agreed) > 0.93

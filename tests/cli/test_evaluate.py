@@ -289,15 +289,15 @@ def broken_relit(folders):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda f: (f.run / "config.json").unlink(), r"expected the folder of a run, got no"),
+        (lambda f: (f.run / "config.json").unlink(), r"folder of a run, but it has no"),
         (lambda f: (f.run / "config.json").write_text("{}"), "config.json: expected data, a"),
         (lambda f: (f.run / "config.json").write_text("{"), "config.json: .* JSON"),
         (
             lambda f: (f.data / "envmaps" / "dim.hdr").write_bytes(b"#?"),
             r"dim\.hdr: expected a header",
         ),
-        (broken_truth, "truth of r_1 to have 16x16 pixels like the test view, got 5x4"),
-        (broken_relit, r"dim/r_0\.png: expected 16x16 pixels like the test view's, got 5x4"),
+        (broken_truth, "truth of r_1 to have 16x16 pixels as in the test view, got 5x4"),
+        (broken_relit, r"dim/r_0\.png: expected 16x16 pixels as in the test view, got 5x4"),
     ],
 )
 def test_bad_folders(folders, relit_calls, change, message):
@@ -311,7 +311,7 @@ def test_bad_folders(folders, relit_calls, change, message):
     [
         ({"samples": 0}, "expected samples >= 1 and bounces >= 0"),
         ({"bounces": -1}, "expected samples >= 1 and bounces >= 0"),
-        ({"light_of": "r_0", "fit_light": True}, "light_of and fit_light exclude one another"),
+        ({"light_of": "r_0", "fit_light": True}, "expected light_of or fit_light, got both"),
     ],
 )
 def test_bad_settings(folders, change, message):

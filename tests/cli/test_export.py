@@ -260,7 +260,7 @@ def test_bad_arguments(tmp_path, name, options, message):
 
 
 def test_errors_leave_nothing_behind(tmp_path, scene, monkeypatch):
-    with pytest.raises(FileNotFoundError, match="no checkpoint"):
+    with pytest.raises(FileNotFoundError, match="not a trained run"):
         task.export(tmp_path, tmp_path / "mesh.ply")
     monkeypatch.setattr("univoxel.scene.load_scene", lambda run: scene)
     with pytest.raises(ValueError, match="without spaces"):

@@ -93,7 +93,7 @@ def test_the_data_set_s_own_world(export, suffix, tmp_path):
             old, new = (found[name][:, :3] @ UPRIGHT for found in places)
             np.testing.assert_allclose(new, turn.inv().apply(old), atol=2e-6)
     save_world(np.column_stack([np.eye(3), [0.0, -5.8e6, 0.0]]), tmp_path)
-    with pytest.raises(UserError, match="expected a data set whose origin is near, got an object"):
+    with pytest.raises(UserError, match="from the origin, which is too far"):
         export(f"far.{suffix}", run=tmp_path, origin="world")
 
 

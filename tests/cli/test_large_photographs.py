@@ -51,7 +51,7 @@ def test_what_was_found_is_remembered(tmp_path, large, read, monkeypatch):
     monkeypatch.setattr(load_images, "FINE", 8)
     assert photos_of(run).cameras.width == 16
     assert photos_of(run, split="train").cameras.width == 16
-    with pytest.raises(UserError, match="the run began with other downscale"):
+    with pytest.raises(UserError, match="the run was started with another downscale"):
         train(cfg, resume=True)
     train(dataclasses.replace(cfg, downscale=2), resume=True)
 
@@ -82,7 +82,7 @@ def test_runs_from_before_kept_their_photographs_whole(tmp_path, large, before):
     assert photos_of(run).cameras.width == 32
     train(config(tmp_path, downscale=1), resume=True)
     path.write_text(json.dumps(values | ({} if before is None else {"downscale": before})))
-    with pytest.raises(UserError, match="the run began with other downscale"):
+    with pytest.raises(UserError, match="the run was started with another downscale"):
         train(config(tmp_path), resume=True)
 
 
@@ -90,10 +90,10 @@ def test_a_run_that_cannot_begin_leaves_nothing(tmp_path, large):
     cfg = config(tmp_path)
     file = cfg.data / "transforms_train.json"
     root = json.loads(file.read_text())
-    for k, frame in enumerate(root["frames"]):  # silhouettes that share no volume
+    for k, frame in enumerate(root["frames"]):  # silhouettes that have no common volume
         frame["transform_matrix"][0][3] += 5 * k
     file.write_text(json.dumps(root))
-    with pytest.raises(UserError, match="share no volume"):
+    with pytest.raises(UserError, match="have no common volume"):
         train(cfg)
     assert not cfg.out.exists()
 
@@ -106,6 +106,6 @@ def test_the_disk_may_be_full(tmp_path, large, monkeypatch, caplog):
 
     monkeypatch.setattr(image_cache, "save_file", full)
     run = train(config(tmp_path))
-    assert "photographs are not kept for the next time" in caplog.text
+    assert "prepared photographs could not be stored" in caplog.text
     assert load_photos(tmp_path / "data").downscale == 2
     assert sorted(p.name for p in run.glob("*photographs*")) == []

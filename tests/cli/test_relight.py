@@ -173,7 +173,7 @@ def test_resolution_scales_the_views(run):
 
 
 def test_test_views_come_from_the_data_of_the_run(run):
-    with pytest.raises(DataError, match=r"expected the folder of a run, got no config\.json"):
+    with pytest.raises(DataError, match=r"a run, but it has no config\.json"):
         frames(run, cameras="test")
     (run / "run" / "config.json").write_text("{}")
     with pytest.raises(DataError, match=r"config\.json: expected data, a folder"):
@@ -191,7 +191,7 @@ def test_test_views_come_from_the_data_of_the_run(run):
         ({"resolution": 0}, ValueError, "resolution must be at least 1, got 0"),
         ({"bounces": -1}, ValueError, "bounces must be at least 0, got -1"),
         ({"exposure": -1.0}, ValueError, "exposure must be finite and at least 0, got -1.0"),
-        ({"maps": ["white", "white"]}, ValueError, "maps of different names"),
+        ({"maps": ["white", "white"]}, ValueError, "maps with different names"),
         ({"maps": []}, ValueError, "expected an environment map, a sun or a point light, got none"),
         ({"rotate": math.inf}, ValueError, "rotate must be finite"),
         ({"noise": 0.0}, ValueError, "noise must be above 0, got 0.0"),

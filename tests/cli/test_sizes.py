@@ -135,7 +135,7 @@ def test_truth_of_another_size_is_refused(runs, data, tmp_path):
     folder = shutil.copytree(data, tmp_path / "data")
     name = load_photos(folder, "test").names[0]
     write_png(folder / "test" / f"{name}_albedo.png", torch.zeros(SIZE + 1, SIZE, 3))
-    with pytest.raises(DataError, match=r"_albedo\.png: expected .* pixels like the photograph's"):
+    with pytest.raises(DataError, match=r"_albedo\.png: expected .* pixels as in the photograph"):
         load_truth(load_photos(folder, "test"), 0)
 
 

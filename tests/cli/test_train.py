@@ -200,7 +200,9 @@ def test_a_model_of_colmap_in_a_world_of_its_own(tmp_path, caplog):
     data = write_colmap(tmp_path / "data", written, parameters=(focal, 32.0, 32.0))
     stages = (plain_stage(voxels=0.01, iterations=40, share=1.0, rays=256),)
     out = train(config(data, tmp_path / "run", stages=stages, downscale=2))
-    said = "COLMAP model, 14 photographs of 32x32 pixels in train, shrunk to 1/2, world turned to"
+    said = (
+        "COLMAP model, 14 photographs of 32x32 pixels in train, downscaled to 1/2, world turned to"
+    )
     assert said in caplog.text
     mesh = extract_mesh(load_scene(out))
     middle = (mesh.vertices.amin(0) + mesh.vertices.amax(0)) / 2
@@ -289,12 +291,12 @@ def test_what_is_pinned_is_so_on_the_grid_of_every_stage_and_after_a_kill(
 
 def test_resume_refuses_another_configuration(run, data):
     cfg = config(data, run)
-    with pytest.raises(ValueError, match=r"the run began with other downscale: .* downscale, "):
+    with pytest.raises(ValueError, match=r"was started with another downscale: .* downscale, "):
         train(dataclasses.replace(cfg, downscale=2), resume=True)
-    with pytest.raises(ValueError, match="the run began with other stages: resume with the same"):
+    with pytest.raises(ValueError, match="was started with another stages: to resume it"):
         train(dataclasses.replace(cfg, stages=cfg.stages[:1]), resume=True)
     for change in ({"masks": "auto"}, {"exposures": True}):
-        with pytest.raises(ValueError, match=f"the run began with other {next(iter(change))}: "):
+        with pytest.raises(ValueError, match=f"was started with another {next(iter(change))}: "):
             train(dataclasses.replace(cfg, **change), resume=True)
     train(dataclasses.replace(cfg, minutes=5.0), resume=True)  # more time is no other run
 
@@ -348,7 +350,7 @@ def test_a_stage_without_a_step_is_said_and_ends_with_code_3(data, tmp_path, mon
     options = ["--out", str(tmp_path / "run"), "--config", str(tmp_path / "config.json")]
     assert main(["train", str(data), *options]) == 3
     said = capsys.readouterr().out
-    assert "Result: unfinished, the time was up: of the planned steps it made 0% for" in said
+    assert "the time limit was too short: of the planned steps it made 0% for" in said
     assert "minutes 0.0001 are enough for about 0% of the steps, --minutes 1 for all" in said
     verdict = load_verdict(tmp_path / "run")
     assert verdict.empty

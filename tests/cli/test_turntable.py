@@ -77,7 +77,7 @@ def test_which_light_it_was(photographs, light, caplog):
         assert found.by_turning_light > 2 * found.by_still_light
         assert found.ahead > 3
         assert told == LightFrame(TURNTABLE)
-        assert "the light turns with the camera, as on a turntable" in caplog.text
+        assert "light: it turns with the camera, as on a turntable" in caplog.text
 
 
 def test_exposures_are_no_light(photographs):
@@ -128,7 +128,7 @@ def test_a_turntable_without_an_axis(photographs):
         [pose[::2, :, 1], -pose[::2, :, 0]], 2
     )  # every other on its side
     tumbled = replace(photos, cameras=replace(photos.cameras, camera_to_world=pose))
-    with pytest.raises(DataError, match="light_frame turntable: the cameras do not stand around"):
+    with pytest.raises(DataError, match="light_frame turntable: the cameras are not around"):
         light_frame_of(tumbled, *hull_of(photos), "turntable")
     assert light_frame_of(tumbled, *hull_of(photos), "auto") == LightFrame()
 
@@ -244,7 +244,7 @@ def test_a_checkpoint_keeps_the_axes(laid, tmp_path):
     ("changes", "message"),
     [
         ({"light": EnvmapConfig()}, "needs hybrid or a local light, sg, sh or mlp, got envmap"),
-        ({"varying": "light"}, "cannot vary otherwise too"),
+        ({"varying": "light"}, "cannot vary as well"),
     ],
 )
 def test_what_does_not_go_with_a_turntable(changes, message):

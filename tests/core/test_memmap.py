@@ -69,7 +69,7 @@ def test_a_full_disk_is_said_at_once(tmp_path, monkeypatch):
     monkeypatch.setattr(memmap, "LARGE", 1000)
     with (
         memmap.large_arrays_in(tmp_path),
-        pytest.raises(OSError, match=r"no room for 1000000\.0 GB"),
+        pytest.raises(OSError, match=r"no space left for 1000000\.0 GB"),
     ):
         memmap.zeros((10**15,), torch.uint8)
 

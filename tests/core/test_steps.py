@@ -24,7 +24,7 @@ def test_a_step_is_done_with_what_it_was_made_of(tmp_path):
 
 def test_another_fingerprint_is_refused(tmp_path):
     files.finish(tmp_path, "cut", {"size": 1})
-    with pytest.raises(ExistingFile, match="cut has other options: choose another out"):
+    with pytest.raises(ExistingFile, match="cut was made with other options: choose"):
         files.done(tmp_path, "cut", {"size": 2})
     with pytest.raises(ExistingFile, match="of size 1"):
         files.done(tmp_path, "cut", {}, lambda before: ExistingFile(f"of size {before['size']}"))

@@ -35,15 +35,15 @@ SHAPE = "{'descr': '<f8', 'fortran_order': False, 'shape': (%s,)}\n"
 def test_broken_npy(tmp_path, content):
     path = tmp_path / "a.npy"
     path.write_bytes(content)
-    with pytest.raises(DataError, match=r"a\.npy: expected an array of NumPy, could not read it"):
+    with pytest.raises(DataError, match=r"a\.npy: this NumPy array could not be read"):
         read_npy(path)
 
 
 def test_an_archive_is_no_array(tmp_path):
     np.savez(tmp_path / "a.npz", a=np.ones(3))
-    with pytest.raises(DataError, match="expected one array of NumPy, got an archive of several"):
+    with pytest.raises(DataError, match="expected one NumPy array, got an archive of several"):
         read_npy(tmp_path / "a.npz")
-    with pytest.raises(DataError, match="expected an array of NumPy, could not read it"):
+    with pytest.raises(DataError, match="this NumPy array could not be read"):
         read_npy(tmp_path / "none.npy")
 
 
@@ -63,7 +63,7 @@ LOCAL, CENTRAL = b"PK\x03\x04", b"PK\x01\x02"
 def test_broken_npz(tmp_path, content):
     path = tmp_path / "a.npz"
     path.write_bytes(content)
-    with pytest.raises(DataError, match=r"a\.npz: expected an npz file, could not read it"):
+    with pytest.raises(DataError, match=r"a\.npz: this npz file could not be read"):
         read_npz(path)
 
 

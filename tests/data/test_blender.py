@@ -224,9 +224,9 @@ def small_mask(folder):
 BROKEN = {
     "no transforms": (
         lambda f: without(f, "transforms_train.json"),
-        r"expected photographs .*, got train \(looked for transforms_train\.json, ",
+        r"expected photographs .*, got train\. If .* \(looked for transforms_train\.json, ",
     ),
-    "broken JSON": (text(b'{\n"frames": [,]\n}'), "broken JSON in line 2, column 12"),
+    "invalid JSON": (text(b'{\n"frames": [,]\n}'), "invalid JSON in line 2, column 12"),
     "not UTF-8": (text(b'{"frames": "\xff\xfe"}'), "expected text in UTF-8"),
     "a list": (text(b"[1, 2]"), r"expected a JSON object, got \[1, 2\]"),
     "no frames": (root(frames=[]), r"expected a list of frames, got \[\]"),
@@ -238,26 +238,23 @@ BROKEN = {
     ),
     "no picture": (
         lambda f: without(f, "train/r_1.png"),
-        r"train\.json: no picture .*train/r_1: 1 of 2 are missing.*for the endings none, \.png",
+        r"train\.json: missing images: .*train/r_1 \(1 of 2\).*for the endings none, \.png",
     ),
-    "empty path": (frame(file_path=""), "train.json: no picture"),
-    "double name": (frame(file_path="./train/r_0.png"), "frame 1: the name r_0 .* came before"),
-    "distortion by k4": (frame(k4=0.1), "frame 1: expected distortion by k1 k2 k3 p1 p2, got k4"),
+    "empty path": (frame(file_path=""), "train.json: missing images"),
+    "double name": (frame(file_path="./train/r_0.png"), "frame 1: the name r_0 .* occurs twice"),
+    "distortion by k4": (frame(k4=0.1), "frame 1: expected distortion k1 k2 k3 p1 p2, got k4"),
     "distortion in words": (frame(k2="no"), "frame 1: expected k2 between -inf and inf, got 'no'"),
     "too much distortion": (root(k1=20.0), "frame 0: its distortion leaves less than 1/2"),
-    "folding distortion": (
-        root(k1=-10.0, k2=30.0),
-        "frame 0: its distortion folds the picture over",
-    ),
+    "folding distortion": (root(k1=-10.0, k2=30.0), "frame 0: its distortion folds the image over"),
     "a fisheye": (root(is_fisheye=True), "frame 0: expected one of the camera models .* a fisheye"),
     "another camera": (frame(camera_model="EQUIRECTANGULAR"), "models .* got 'EQUIRECTANGULAR'"),
-    "size unlike the file's": (root(w=60, h=30), r"pictures of 60x30 pixels \(w and h\), got 6x4"),
-    "transparent": (transparent, "all 2 pictures are fully transparent"),
-    "opaque": (all_opaque, "all 2 pictures are fully opaque: cut the object out"),
+    "size unlike the file's": (root(w=60, h=30), r"images of 60x30 pixels \(w and h\), got 6x4"),
+    "transparent": (transparent, "all 2 images are fully transparent"),
+    "opaque": (all_opaque, "all 2 images are fully opaque: cut out the object"),
     "no alpha": (opaque, r"r_1\.png: expected an alpha channel or a mask r_1_mask\.png"),
-    "grey": (gray, r"r_1\.png: expected a picture with 3 or 4 channels, got 1"),
+    "grey": (gray, r"r_1\.png: expected an image with 3 or 4 channels, got 1"),
     "mask of another size": (small_mask, r"r_1_mask\.png: expected 6x4 pixels, got 2x2"),
-    "formats mixed": (mixed, r"r_1\.exr: expected the format of r_0"),
+    "formats mixed": (mixed, r"in the format of r_0"),
     "no matrix": (
         matrix(lambda m: None),
         "frame 0: expected a finite 4x4 transform_matrix, got None",
@@ -265,7 +262,7 @@ BROKEN = {
     "small matrix": (matrix(lambda m: m[:2]), "frame 0: expected a finite 4x4"),
     "ragged matrix": (matrix(lambda m: [[1.0], [1.0, 2.0]]), "frame 0: expected a finite 4x4"),
     "NaN in the matrix": (matrix(lambda m: m * np.nan), "frame 0: expected a finite 4x4"),
-    "singular matrix": (
+    "a singular one": (
         matrix(lambda m: m * [0, 1, 1, 1]),
         "frame 0: expected a rigid .* scales by 1, 1, 0",
     ),
@@ -305,7 +302,7 @@ def test_no_reader_outlives_an_error(scene):
     that was just starting has hung in it."""
     BROKEN["formats mixed"][0](scene)
     before = threading.active_count()
-    with pytest.raises(DataError, match="expected the format of r_0") as caught:
+    with pytest.raises(DataError, match="the format of r_0") as caught:
         load_photos(scene)
     assert caught.value.__traceback__ is not None  # which holds all frames
     assert threading.active_count() == before
@@ -314,7 +311,7 @@ def test_no_reader_outlives_an_error(scene):
 def test_missing_and_empty_folders(tmp_path):
     with pytest.raises(DataError, match="none: expected a folder with a scene, got nothing there"):
         load_photos(tmp_path / "none")
-    with pytest.raises(DataError, match=r"got an empty folder \(looked for transforms_test"):
+    with pytest.raises(DataError, match=r"got an empty folder.*\(looked for transforms_test"):
         load_photos(tmp_path, "test")
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match="file: expected a folder with a scene, got a file"):
@@ -324,7 +321,7 @@ def test_missing_and_empty_folders(tmp_path):
 def test_full_folders_are_not_listed_whole(tmp_path):
     for k in range(9):
         (tmp_path / f"{k}.txt").write_text("")
-    with pytest.raises(DataError, match=r"got 0\.txt, .*4\.txt, \.\.\. \("):
+    with pytest.raises(DataError, match=r"got 0\.txt, .*4\.txt, \.\.\.\. If .* \("):
         load_photos(tmp_path)
 
 

@@ -181,7 +181,7 @@ def test_lists_are_read_as_they_were_meant(tmp_path, writer, name, change):
         assert torch.equal(alpha, wanted[color][0])
         torch.testing.assert_close(camera, wanted[color][1:], atol=1e-5, rtol=1e-5)
     about = load_photos(data).about
-    assert ("cameras of 10 scaled to smaller pictures" in about) == (name == "smaller")
+    assert ("cameras of 10 scaled to smaller images" in about) == (name == "smaller")
 
 
 def test_pictures_of_one_name_in_two_folders(tmp_path):
@@ -244,7 +244,7 @@ def test_a_lens_of_larger_pictures_is_told(tmp_path, caplog):
     text("transforms.json", ('"w": 12, ', ""), ('"h": 8, ', ""))(data)
     text("transforms.json", (r'"cx": [\d.]+', '"cx": 12.0'), (r'"cy": [\d.]+', '"cy": 8.0'))(data)
     load_photos(data)
-    assert "cx and cy are at the border of pictures of 12x8 pixels" in caplog.text
+    assert "cx and cy are at the border of the 12x8 images" in caplog.text
 
 
 def no_images(place, other):
@@ -268,22 +268,22 @@ def two_fit(folder):
         (
             write_nerfstudio,
             text("transforms.json", ("images/p", "/a/../images/p")),
-            "10 of 10 are missing",
+            "10 of 10",
         ),
         (
             write_nerfstudio,
             no_images("images", "images_2"),
-            "images_2 is there: rename it to images, and cameras are scaled",
+            "images_2 exists: rename it to images, and the cameras are scaled",
         ),
         (
             write_polycam,
             lambda f: (f / "keyframes/corrected_images").rename(f / "keyframes/images"),
-            "corrected_images; those in .*keyframes/images are of the cameras in .*/cameras",
+            "corrected_images; those in .*keyframes/images belong to the cameras in .*/cameras",
         ),
         (
             write_nerfstudio,
             text("transforms.json", ('"k1": 0.0', '"k5": 0.1')),
-            "expected distortion by k1 k2 k3 p1 p2, got k5 too",
+            "expected distortion k1 k2 k3 p1 p2, got k5 too",
         ),
         (
             lambda f, s: write_colmap(
@@ -303,9 +303,9 @@ def test_what_helps_is_said(tmp_path, writer, change, message):
 def test_cameras_of_a_rig_are_named(tmp_path):
     write_metashape(tmp_path, scene())
     text("cameras.xml", ('label="not_placed"', 'label="right" master_id="0"'))(tmp_path)
-    assert "; 1 of a rig, whose place is that of a master camera" in load_photos(tmp_path).about
+    assert "; 1 belong to a rig" in load_photos(tmp_path).about
 
 
 def test_one_photograph_is_told(tmp_path, caplog):
     load_photos(write_nerfstudio(tmp_path, scene(2), test_filenames=["images/p_000.png"]))
-    assert "one photograph shows no shape: at least 3 views are needed" in caplog.text
+    assert "one view does not give a shape: at least 3" in caplog.text

@@ -42,13 +42,13 @@ def moved(place: object):
         (lambda r: r.update(k1=GIANT), "frame 0: expected k1 between -inf and inf, got 1000"),
         (lambda r: r.update(fl_x=1e-320), "frame 0: expected focal lengths from 0.006 to 1.2e"),
         (lambda r: r.update(fl_x=1e39), "frame 0: expected focal lengths from 0.006 to 1.2e"),
-        (lambda r: r.update(p1=1e30), "frame 0: expected coefficients of distortion up to 1e"),
+        (lambda r: r.update(p1=1e30), "frame 0: expected distortion coefficients up to 1e"),
         (lambda r: [r.pop("fl_x"), r.update(camera_angle_x=1e-320)], "0: expected focal lengths"),
         (lambda r: [r.pop("fl_x"), r.update(camera_angle_x=3.14159265)], "expected focal lengths"),
         (moved(GIANT), "frame 0: expected a finite 4x4 transform_matrix, got"),
         (moved(1e308), r"frame 0: expected numbers up to 1e\+09, got 1e\+308"),
         (lambda r: r["frames"][0].update(file_path="a\0b"), "expected an object with a file_path"),
-        (lambda r: r["frames"][0].update(mask_path="a\0b"), "frame 0: no mask"),
+        (lambda r: r["frames"][0].update(mask_path="a\0b"), "frame 0: the mask"),
     ],
 )
 def test_numbers_that_no_camera_has(data, change, message):
@@ -72,7 +72,7 @@ def test_numbers_of_colmap(tmp_path, number):
     with pytest.raises(DataError, match=r"cameras\.txt: .*(focal lengths|parameters \[inf)"):
         load_photos(folder)
     path.write_text(text.replace(" 12 ", f" {10**400} "))
-    with pytest.raises(DataError, match=r"cameras\.txt: expected a file of a COLMAP model"):
+    with pytest.raises(DataError, match=r"cameras\.txt: this file of a COLMAP model"):
         load_photos(folder)
 
 
@@ -88,11 +88,11 @@ def test_places_of_colmap(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (b"[" * 100_000, "nested too deep"),
-        (b'{"a":' * 100_000, "nested too deep"),
-        (b'{"a": ' + b"1" * 5000 + b"}", "an integer of too many digits"),
+        (b"[" * 100_000, "too deep a nesting"),
+        (b'{"a":' * 100_000, "too deep a nesting"),
+        (b'{"a": ' + b"1" * 5000 + b"}", "an integer has too many digits"),
         (b"\xff\xfe{}", "expected text in UTF-8"),
-        (b"{", "broken JSON in line 1, column 2"),
+        (b"{", "invalid JSON in line 1, column 2"),
     ],
 )
 def test_json_that_cannot_be_read(data, tmp_path, text, message):
@@ -121,12 +121,12 @@ def test_names_come_before_pictures(data, tmp_path, monkeypatch, layout):
     monkeypatch.setattr("univoxel.data.colmap.image_size", opened)
     if layout == "nerf":
         edit(data / "transforms.json", lambda r: r.update(frames=r["frames"][:1] * 9))
-        message = r"frame 1: the name p_009 of images/p_009\.png came before"
+        message = r"frame 1: the name p_009 of images/p_009\.png occurs twice"
     else:
         data = write_colmap(tmp_path / "colmap", scene(), text=True)
         path = data / "sparse/0/images.txt"
         path.write_text(path.read_text().replace("p_003.png", "p_004.png"))
-        message = r"images\.txt: expected names of photographs, each once, got 'p_004\.png'"
+        message = r"images\.txt: expected photographs with unique names, got 'p_004\.png'"
     with pytest.raises(DataError, match=message):
         load_photos(data)
 
@@ -143,7 +143,7 @@ def test_links_out_of_the_folder(tmp_path, writer):
     elsewhere = tmp_path / "elsewhere.png"
     picture.rename(elsewhere)
     picture.symlink_to(elsewhere)
-    with pytest.raises(DataError, match=r"expected files in .*data, got .*elsewhere\.png"):
+    with pytest.raises(DataError, match=r"expected files inside .*data, got .*elsewhere\.png"):
         load_photos(data)
     assert len(load_photos(data, allow_outside=True)) == 8
     # A link within, and a folder that is itself a link, are as any other
@@ -163,7 +163,7 @@ def test_paths_out_of_the_folder(data, tmp_path, monkeypatch, key, absolute):
     named = str(elsewhere) if absolute else "../p_009.png"
     edit(data / "transforms.json", lambda r: r["frames"][0].update({key: named}))
     with pytest.raises(
-        DataError, match=r"frame 0: expected files in .*data, got .*p_009\.png"
+        DataError, match=r"frame 0: expected files inside .*data, got .*p_009\.png"
     ) as e:
         load_photos(data)
     assert e.value.arguments == ("allow_outside",)
@@ -179,7 +179,7 @@ def test_names_of_colmap_out_of_the_folder(tmp_path):
     (data / "images" / "p_004.png").rename(tmp_path / "p_004.png")
     path = data / "sparse/0/images.txt"
     path.write_text(path.read_text().replace("p_004.png", "../../p_004.png"))
-    with pytest.raises(DataError, match=r"images\.txt: expected files in .*data, got .*p_004\.png"):
+    with pytest.raises(DataError, match=r"images\.txt: expected files inside .*data, .*p_004\.png"):
         load_photos(data)
 
 
@@ -198,7 +198,7 @@ def test_cameras_that_are_a_link_out_of_the_folder(tmp_path, layout):
     for number, path in enumerate(described):
         path.rename(elsewhere / f"{number}{path.suffix}")
         path.symlink_to(elsewhere / f"{number}{path.suffix}")
-    with pytest.raises(DataError, match=r"expected files in .*data, got .*elsewhere.*allow_out"):
+    with pytest.raises(DataError, match=r"expected files inside .*data, got .*elsewhere.*allow"):
         load_photos(data)
     assert len(load_photos(data, allow_outside=True)) == 8
 
@@ -211,7 +211,7 @@ def test_names_that_mean_another_folder(data, file_path, file, name):
     """Results are written under the names of views: `relight` wrote OUT.png beside OUT."""
     edit(data / "transforms.json", lambda r: r["frames"][1].update(file_path=file_path))
     (data / "images" / "p_008.png").rename(data / file)
-    message = f"frame 1: expected names that files can have, got '{name}'"
+    message = f"frame 1: expected valid file names, got '{name}'"
     with pytest.raises(DataError, match=message):
         load_photos(data, "test")  # it is the first by name
     with pytest.raises(DataError, match=message):

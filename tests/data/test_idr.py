@@ -79,7 +79,7 @@ def test_pictures_that_are_not_there(tmp_path):
         (tmp_path / place / "004.png").unlink()
     photos = load_photos(tmp_path)
     assert photos.names == ["001", "002", "003", "005", "006", "007", "008"]
-    assert "1 of 10 listed left out" in photos.about
+    assert "1 of 10 listed images left out" in photos.about
     wanted = written.poses[[1, 2, 3, 5, 6, 7, 8], :3, 3]
     np.testing.assert_allclose(photos.cameras.camera_to_world[:, :, 3], wanted, atol=1e-5)
 
@@ -105,7 +105,7 @@ def leaning(arrays):
     [
         (
             lambda f: (f / "cameras_sphere.npz").write_bytes(b"no archive"),
-            "cameras_sphere.npz: expected an npz file, could not read it",
+            "cameras_sphere.npz: this npz file could not be read",
         ),
         (edited(dict.clear), "cameras_sphere.npz: expected arrays world_mat_0, .* got none"),
         (edited(lambda a: a.update(world_mat_2=np.eye(3))), r"npz: expected world_mat_2 \[4, 4\]"),
@@ -115,19 +115,19 @@ def leaning(arrays):
         ),
         (
             edited(lambda a: a.update(world_mat_2=np.full((4, 4), np.nan))),
-            "npz: world_mat_2 holds NaN or infinity",
+            "npz: world_mat_2 contains NaN or infinity",
         ),
         (
             edited(lambda a: a.update(world_mat_2=np.ones((4, 4)))),
-            "world_mat_2: expected a projection onto a picture, got a singular matrix",
+            "world_mat_2: expected a projection matrix, got a singular one",
         ),
-        (edited(leaning), "world_mat_3: expected pixels with axes square .* lean by 1 pixels"),
+        (edited(leaning), "world_mat_3: .* axes that are skewed by 1 pixels"),
         (
             edited(lambda a: a.update(world_mat_2=np.diag([50.0, 1, 1, 1]) @ a["world_mat_2"])),
             "world_mat_2: expected cx between -12 and 24, got 300",
         ),
         (edited(lambda a: a.pop("world_mat_9")), "expected a world_mat for each of 10"),
-        (lambda f: (f / "image").rename(f / "photos"), "npz: no pictures in .*image"),
+        (lambda f: (f / "image").rename(f / "photos"), "npz: no images in .*image"),
         (
             lambda f: write_png(f / "mask" / "p_003.png", np.ones((4, 4), np.uint8)),
             "p_003.png: expected 12x8 pixels, got 4x4",

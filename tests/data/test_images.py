@@ -120,7 +120,7 @@ def test_hdr_in_a_png_is_refused(tmp_path):
     data = (tmp_path / "a.png").read_bytes()
     hlg = chunk(b"cICP", bytes([9, 18, 0, 1]))
     (tmp_path / "a.png").write_bytes(data[:33] + hlg + data[33:])
-    with pytest.raises(DataError, match=r"a\.png: expected colours of sRGB, got HLG \(HDR\)"):
+    with pytest.raises(DataError, match=r"a\.png: expected sRGB colours, got HLG \(HDR\)"):
         images.read_image(tmp_path / "a.png", in_srgb=True)
 
 
@@ -159,13 +159,13 @@ def test_other_kinds_under_the_name_of_jpeg(tmp_path):
         assert images.image_size(path) == (5, 3)
     path.write_bytes(b"\0\0\0\x18ftypheic" + bytes(40))
     for read in (images.read_image, images.image_size):
-        with pytest.raises(DataError, match=r"a\.jpg: .*got HEIC or AVIF under that name: convert"):
+        with pytest.raises(DataError, match=r"a\.jpg: .*it is in fact HEIC or AVIF: convert"):
             read(path)
     Image.fromarray(np.zeros((3, 5), np.float32)).save(tmp_path / "a.tif")
-    with pytest.raises(DataError, match="expected a picture of 8 or 16 bits, got one of 32"):
+    with pytest.raises(DataError, match="expected an image of 8 or 16 bits, got 32"):
         images.read_image(tmp_path / "a.tif")
     (tmp_path / "a.tif").write_bytes(b"II*\0" + bytes(40))
-    with pytest.raises(DataError, match=r"could not read this TIFF: .*: convert it to"):
+    with pytest.raises(DataError, match=r"this TIFF could not be read: .*: convert it to"):
         images.read_image(tmp_path / "a.tif")
 
 
@@ -250,7 +250,7 @@ def test_an_exr_of_several_parts(tmp_path):
     OpenEXR.File(parts[:2]).write(str(tmp_path / "a.exr"))
     assert sorted(images.read_exr(tmp_path / "a.exr")) == ["B", "G", "R"]
     OpenEXR.File(parts).write(str(tmp_path / "a.exr"))
-    with pytest.raises(DataError, match="got parts with colours: depth, beauty, diffuse: write th"):
+    with pytest.raises(DataError, match="got several parts with colours: depth, beauty, diffuse"):
         images.read_image(tmp_path / "a.exr")
 
 
@@ -318,7 +318,7 @@ def test_a_sun_that_half_floats_do_not_hold(tmp_path, caplog):
     channels = {c: value.astype(np.float16) for c in "RGB"}
     OpenEXR.File({"type": OpenEXR.scanlineimage}, channels).write(str(tmp_path / "a.exr"))
     assert read_map(tmp_path / "a.exr").radiance[1, 2].tolist() == [900] * 3
-    assert "infinite radiance is taken as the largest there is, 900" in caplog.text
+    assert "infinite radiance is replaced by 900" in caplog.text
     with pytest.raises(DataError, match="NaN or infinity at row 1, column 2"):
         images.read_image(tmp_path / "a.exr")
     value[1, 2] = np.nan
@@ -340,7 +340,7 @@ def test_maps_that_are_nearly_right(tmp_path):
         read_map(tmp_path / "a.exr")
     Image.new("RGB", (8, 4)).save(tmp_path / "a.jpg")
     with pytest.raises(
-        DataError, match=r"a\.jpg: expected a map of light, \.hdr or \.exr, got a pi"
+        DataError, match=r"a\.jpg: expected an environment map, \.hdr or \.exr, got an im"
     ):
         read_map(tmp_path / "a.jpg")
 
@@ -423,15 +423,15 @@ def test_run_lengths_are_decoded(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"P6 8 2 255", r"expected a Radiance picture .* got b'P6 8 2 2'"),
+        (b"P6 8 2 255", r"expected a Radiance image .* got b'P6 8 2 2'"),
         (b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n", "expected a header and pixels"),
         (radiance(bytes(64), form="32-bit_rle_xyze"), "expected FORMAT=32-bit_rle_rgbe, got"),
         (radiance(bytes(64), size="+Y 2 +X 8"), r"expected the size .* got b'\+Y 2"),
         (radiance(b"", size="-Y 0 +X 8"), "expected the size"),
         (radiance(bytes(63)), "expected 64 bytes of 8x2 flat pixels .* got 63"),
-        (radiance([2, 2, 0, 8, 128 + 8]), "row 0 of 2 is cut off"),
-        (radiance([2, 2, 0, 8, 128 + 9, 1]), "row 0 of 2 is cut off or broken"),
-        (radiance([2, 2, 0, 8, 0, 1]), "row 0 of 2 is cut off or broken"),
+        (radiance([2, 2, 0, 8, 128 + 8]), "row 0 of 2 is truncated"),
+        (radiance([2, 2, 0, 8, 128 + 9, 1]), "row 0 of 2 is truncated or damaged"),
+        (radiance([2, 2, 0, 8, 0, 1]), "row 0 of 2 is truncated or damaged"),
         (radiance([2, 2, 0, 8] + [128 + 8, 1] * 4), "row 1 of 2 is missing"),
     ],
 )
@@ -476,7 +476,7 @@ def test_empty_missing_and_foreign_files(tmp_path, suffix):
     with pytest.raises(DataError, match="the file is empty"):
         images.read_image(path)
     path.write_bytes(b"this is no picture, whatever its name says" * 20)
-    with pytest.raises(DataError, match=rf"a\{suffix}: expected"):
+    with pytest.raises(DataError, match=rf"a\{suffix}: (?:expected|this)"):
         images.read_image(path)
     path.unlink()
     path.mkdir()
@@ -494,7 +494,7 @@ def test_png_that_declares_a_huge_size(tmp_path):
 
 
 def test_unknown_suffix(tmp_path):
-    with pytest.raises(DataError, match=r"expected a picture \(\.png .* got '\.bmp'"):
+    with pytest.raises(DataError, match=r"expected an image \(\.png .* got '\.bmp'"):
         images.read_image(tmp_path / "a.bmp")
 
 
@@ -514,7 +514,7 @@ def test_pictures_of_telephones(tmp_path, read, name):
     [
         (np.zeros((2, 3, 2)), r"must be \[H, W\(, 3 or 4\)\], got \[2, 3, 2\]"),
         (np.zeros(3), r"got \[3\]"),
-        (np.full((2, 2), np.nan), "holds NaN"),
+        (np.full((2, 2), np.nan), "contains NaN"),
         (np.zeros((2, 2), np.int64), "must be uint8 or floating, got int64"),
     ],
 )
@@ -591,7 +591,7 @@ def test_size_without_reading(tmp_path, name):
         Image.fromarray(np.zeros((3, 5, 3), np.uint8)).save(path)
     assert images.image_size(path) == (5, 3)
     path.write_bytes(path.read_bytes()[:20])
-    with pytest.raises(DataError, match=rf"{name}: expected .* could not read it"):
+    with pytest.raises(DataError, match=rf"{name}: .*could not be read"):
         images.image_size(path)
     path.write_bytes(b"")
     with pytest.raises(DataError, match=rf"{name}: the file is empty"):
@@ -611,7 +611,7 @@ def test_what_openexr_says_of_damage_stays_away(tmp_path, capfd):
     capfd.readouterr()
     with ThreadPoolExecutor(4) as pool:
         failures = list(pool.map(failure_of, [path] * 16))
-    assert all("expected an OpenEXR file, could not read it" in str(f) for f in failures)
+    assert all("this OpenEXR file could not be read" in str(f) for f in failures)
     os.write(2, b"heard")
     assert capfd.readouterr().err == "heard"
 

@@ -171,7 +171,7 @@ def test_cameras_on_their_side_do_not_say_what_is_up(tmp_path):
     turn[:2, :2] = [[0, -1], [1, 0]]
     lying = written.poses @ turn
     photos = load_photos(write_colmap(tmp_path, type(written)(lying, written.pictures)))
-    assert photos.about.endswith("world as in the files: its cameras do not say what is up")
+    assert photos.about.endswith("world not turned upright: its cameras do not show what is up")
     wanted = torch.from_numpy(lying[written.split("train"), :3, 3]).float()
     torch.testing.assert_close(photos.cameras.camera_to_world[:, :, 3], wanted)
 
@@ -179,7 +179,7 @@ def test_cameras_on_their_side_do_not_say_what_is_up(tmp_path):
 @pytest.mark.parametrize("writer", [write_colmap, write_nerfstudio, write_llff])
 def test_splits_that_cannot_be_made(tmp_path, writer):
     writer(tmp_path / "one", scene(views=1))
-    with pytest.raises(DataError, match="one: expected two photographs at least, got 1"):
+    with pytest.raises(DataError, match="one: expected at least two photographs, got 1"):
         load_photos(tmp_path / "one")
     writer(tmp_path / "two", scene(views=2))
     with pytest.raises(DataError, match="two: expected split train or test, got val"):

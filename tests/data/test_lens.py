@@ -127,7 +127,7 @@ def write_transforms(folder, kind):
 def test_loaded_photographs_are_those_of_pinholes(tmp_path, write, kind):
     write(tmp_path, kind)
     photos = load_photos(tmp_path, "test")
-    assert photos.about.endswith("96x64 pixels in test, lens distortion taken out")
+    assert photos.about.endswith("96x64 pixels in test, lens distortion removed")
     rays, pose = image_rays(photos.cameras, 0), photos.cameras.camera_to_world[0]
     local = rays.direction @ pose[:, :3]
     x, y = (local[:, 0] / -local[:, 2]).numpy(), (-local[:, 1] / -local[:, 2]).numpy()

@@ -23,7 +23,7 @@ def test_downscale(tmp_path, writer):
     """Means in linear light, weighted by alpha; the same points in pictures of half the size."""
     written = scene()
     photos = load_photos(writer(tmp_path, written), "test", downscale=2)
-    assert photos.about.endswith("6x4 pixels in test, shrunk to 1/2")
+    assert photos.about.endswith("6x4 pixels in test, downscaled to 1/2")
     assert photos.downscale == 2
     stored = torch.from_numpy(written.pictures[written.split("test")]).double() / 255
     linear, alpha = srgb_to_linear(stored[..., :3]), stored[..., 3:]
@@ -104,7 +104,7 @@ def test_downscales_out_of_range(tmp_path):
     write_nerf(tmp_path, scene())
     with pytest.raises(ValueError, match="downscale must be at least 1, got -1"):
         load_photos(tmp_path, downscale=-1)
-    with pytest.raises(DataError, match="downscale=9 leaves nothing of 12x8"):
+    with pytest.raises(DataError, match="downscale=9 leaves no pixels of 12x8"):
         load_photos(tmp_path, downscale=9)
 
 

@@ -79,7 +79,7 @@ def test_a_mask_is_of_the_photograph_that_it_names_most_exactly(tmp_path, folder
 def test_a_mask_of_two_photographs(tmp_path, folder):
     save(folder / "1.png", np.zeros((2, 2)))
     asked = [(f"{side}/1", tmp_path / side / "1.jpg") for side in ("left", "right")]
-    with pytest.raises(DataError, match=r"masks/1\.png: expected a mask of one photograph, its na"):
+    with pytest.raises(DataError, match=r"masks/1\.png: expected a mask of one photograph, but"):
         masks_in(folder, asked)
 
 
@@ -165,7 +165,7 @@ def test_folders_that_are_none(tmp_path, folder):
     with pytest.raises(DataError, match="masks: expected a folder of masks, got nothing there"):
         masks_in(folder, asked)
     folder.mkdir()
-    with pytest.raises(DataError, match=r"expected masks .*, got no picture"):
+    with pytest.raises(DataError, match=r"expected masks .*, found no image"):
         masks_in(folder, asked)
 
 
@@ -228,7 +228,7 @@ def test_masks_of_32_bits(tmp_path, kind, top):
     Image.fromarray((top * HALF).astype(kind)).save(tmp_path / "a.tif")
     assert coverage_in(tmp_path / "a.tif").tolist() == HALF.tolist()
     Image.fromarray((1e9 * HALF).astype(kind)).save(tmp_path / "a.tif")
-    with pytest.raises(DataError, match=r"a\.tif: expected a mask of numbers up to 65535, got"):
+    with pytest.raises(DataError, match=r"a\.tif: expected mask values up to 65535, got"):
         coverage_in(tmp_path / "a.tif")
 
 
@@ -285,16 +285,16 @@ def test_soft_masks_stay_as_they_are(tmp_path):
 @pytest.mark.parametrize(
     ("picture", "message"),
     [
-        (Image.fromarray(np.array([[0, 1, 2]], np.uint8)), "largest value of 2 of 255"),
-        (palette([[0, 1, 2]], (0, 0, 0), (128, 0, 0), (0, 128, 0)), "a palette of 3 colours"),
-        (palette([[0, 1, 1]], (9, 9, 200), (128, 0, 0)), "a palette of 2 colours"),
+        (Image.fromarray(np.array([[0, 1, 2]], np.uint8)), "maximum of 2 of 255"),
+        (palette([[0, 1, 2]], (0, 0, 0), (128, 0, 0), (0, 128, 0)), "a palette with 3 colours"),
+        (palette([[0, 1, 1]], (9, 9, 200), (128, 0, 0)), "a palette with 2 colours"),
         (
             Image.fromarray(np.random.default_rng(0).integers(0, 255, (9, 9, 3), np.uint8)),
-            "got a picture of several colours",
+            "got an image with several colours",
         ),
         (
             Image.fromarray(np.array([[[255] * 3, [255, 0, 0]]], np.uint8)),
-            "got a picture of several colours",
+            "got an image with several colours",
         ),
     ],
 )
@@ -321,7 +321,7 @@ def test_inverted_masks_are_refused(tmp_path):
     assert load_photos(data).alpha.any()
     for path in (data / "masks").iterdir():
         save(path, 255 - np.asarray(Image.open(path)))
-    with pytest.raises(DataError, match=r"8 of 8 masks that .* are white along .* to be inverted"):
+    with pytest.raises(DataError, match=r"8 of 8 sampled masks are white along .* to be inverted"):
         load_photos(data)
 
 
@@ -355,7 +355,7 @@ def test_masks_of_pictures_that_were_mirrored_or_turned(lit, way, word):
     assert load_photos(lit).alpha.any()
     for path in (lit / "masks").iterdir():
         save(path, way(np.asarray(Image.open(path))))
-    with pytest.raises(DataError, match=f"8 of 8 masks .* fit their photographs when {word}"):
+    with pytest.raises(DataError, match=f"8 of 8 sampled masks fit .* only when {word}"):
         load_photos(lit)
 
 
@@ -378,16 +378,14 @@ def test_colours_that_are_multiplied_by_alpha_are_told(lit, caplog, straight):
         write_png(path, np.concatenate([color, alpha[..., None]], -1))
         mask.unlink()
     load_photos(lit)
-    assert ("colours seem to be multiplied by alpha" in caplog.text) != straight
+    assert ("colours seem to be premultiplied by alpha" in caplog.text) != straight
 
 
 def test_faint_masks_are_refused(lit):
     for path in (lit / "masks").iterdir():
         mask = np.asarray(Image.open(path)) // 4
         save(path, mask + np.arange(40) % 20)
-    with pytest.raises(
-        DataError, match=r"expected masks .*, got a largest value of 82 of 255 in 8"
-    ):
+    with pytest.raises(DataError, match=r"expected masks .*, got a maximum of 82 of 255 in 8"):
         load_photos(lit)
 
 
@@ -456,8 +454,8 @@ def test_colours_tell_what_masks_were_made_of(tmp_path, caplog, square, upright)
     red = photos.color[..., 0] > 120
     assert torch.equal(photos.alpha > 127, red)
     assert photos.alpha.any()
-    what = "the upright picture" if upright else "the pixels as they are stored"
-    assert f"8 photographs have an EXIF orientation: their masks are taken as made of {what}" in (
+    what = "the upright image" if upright else "the stored pixels"
+    assert f"8 photographs have an EXIF orientation: their masks seem to be made for {what}" in (
         caplog.text
     )
 

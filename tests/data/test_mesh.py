@@ -53,7 +53,7 @@ def test_other_files_are_refused(tmp_path, change, message):
 def test_places_that_are_not_finite_are_refused(tmp_path):
     path = tmp_path / "mesh.ply"
     write_ply(path, Mesh(VERTICES / torch.tensor([1.0, 0, 1]), FACES))
-    with pytest.raises(DataError, match=r"mesh.ply: expected vertices at finite places"):
+    with pytest.raises(DataError, match=r"mesh.ply: expected finite vertices"):
         read_ply(path)
 
 

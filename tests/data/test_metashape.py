@@ -36,7 +36,7 @@ def test_lenses_bend_as_the_manual_says(tmp_path):
 
 def test_distortion_is_taken_out(tmp_path):
     photos = load_photos(write_metashape(tmp_path, scene(), calibration(k1=0.01)))
-    assert "lens distortion taken out" in photos.about
+    assert "lens distortion removed" in photos.about
 
 
 def test_the_largest_component_is_read(tmp_path):
@@ -78,27 +78,27 @@ SENSOR = '<sensor id="3" label="unknown" type="frame">'
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (edited(("</chunk>", "")), "cameras.xml: expected XML, could not read it: mismatched tag"),
+        (edited(("</chunk>", "")), "cameras.xml: this XML could not be read: mismatched tag"),
         (
             edited(("<document", '<!DOCTYPE d [<!ENTITY a "b">]><document')),
-            "cameras.xml: expected XML of Metashape, got one with definitions of its own",
+            "cameras.xml: expected Metashape XML, got XML with its own",
         ),
         (
             edited(("<chunk", "<x><chunk"), ("</chunk>", "</chunk></x>")),
             "expected one chunk, got 0",
         ),
         (edited(("transform>", "other>")), "xml: expected cameras with a transform, got 11"),
-        (edited((SENSOR, '<sensor id="4">')), "sensor 3 of p_000: expected it among the sensors"),
+        (edited((SENSOR, '<sensor id="4">')), "sensor 3 of p_000: expected a known sensor"),
         (edited((SENSOR, '<sensor id="3" type="fisheye">')), "expected a sensor of type frame"),
-        (edited(("calibration", "other")), "sensor 3 of p_000: expected a calibration, got none"),
+        (edited(("calibration", "other")), "sensor 3 of p_000: expected a calibration, found none"),
         (edited(("<f>11.0</f>", "")), "sensor 3 of p_000: expected a number as f, got nothing"),
         (edited(("<f>11.0", "<f>wide")), "sensor 3 of p_000: expected a number as f, got 'wide'"),
         (edited(("<f>11.0", "<f>-11.0")), "sensor 3 of p_000: expected fl_x between 0 and inf"),
-        (edited(("<f>11.0", "<p3>.1</p3><f>11.0")), "expected distortion by k1 to k4, p1 and p2"),
-        (edited(("<f>11.0", "<b2>2</b2><f>11.0")), "p_000: expected pixels with axes square"),
+        (edited(("<f>11.0", "<p3>.1</p3><f>11.0")), "expected distortion k1 to k4, p1 and p2"),
+        (edited(("<f>11.0", "<b2>2</b2><f>11.0")), "p_000: expected pixels with perp"),
         (edited(('width="12"', 'width="0"')), "sensor 3 of p_000: expected a resolution above 0,"),
         (edited(('width="12"', "")), "sensor 3 of p_000: expected a number as width, got nothing"),
-        (edited(('width="12"', 'width="9"')), r"p_000.png: expected a picture of the shape 9x8"),
+        (edited(('width="12"', 'width="9"')), r"p_000.png: expected an image with the shape 9x8"),
         (edited(("<scale>2.5", "<scale>-2.5")), "transform of component 0: expected a scale"),
         (edited(("<scale>2.5", "<scale>2.5 1")), "transform of component 0: expected 1 numbers"),
         (edited(("<rotation>", "<rotation>1 ")), "transform of component 0: expected 9 numbers"),
@@ -106,7 +106,7 @@ SENSOR = '<sensor id="3" label="unknown" type="frame">'
             edited(('label="p_000"><transform>', 'label="p_000"><transform>1 ')),
             "camera p_000: expected 16 numbers as transform",
         ),
-        (lambda f: (f / "images").rename(f / "photos"), "cameras.xml: no picture p_000, p_001,"),
+        (lambda f: (f / "images").rename(f / "photos"), "cameras.xml: missing images: p_000"),
     ],
 )
 def test_one_line_for_what_is_broken(tmp_path, damage, message):

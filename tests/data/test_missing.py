@@ -25,9 +25,9 @@ def test_pictures_that_are_not_there_are_left_out(tmp_path, writer, caplog):
     with caplog.at_level(logging.WARNING, "univoxel"):
         photos = load_photos(data)
     listed = 8 if writer is write_nerf else 10  # which has a file for each split
-    assert f"3 of {listed} listed left out: no such pictures" in photos.about
+    assert f"3 of {listed} listed images left out because they are missing" in photos.about
     assert all(f"p_00{v}" in caplog.messages[0] for v in lost)
-    assert caplog.messages[0].endswith(f"3 of {listed} left out")
+    assert caplog.messages[0].endswith(f"(3 of {listed} left out)")
     if writer is write_nerf:
         assert photos.names == ["p_001", "p_003", "p_004", "p_007", "p_009"]
         return
@@ -50,7 +50,7 @@ def test_how_many_must_remain(tmp_path, views, lost, enough):
     if enough:
         assert f"{lost} of {views} listed" in load_photos(data).about
         return
-    with pytest.raises(DataError, match=f"images.bin: no picture .*: {lost} of {views} are missin"):
+    with pytest.raises(DataError, match=rf"images.bin: missing .*\({lost} of {views}\)"):
         load_photos(data)
 
 
@@ -64,7 +64,7 @@ def test_splits_that_name_what_is_not_there(tmp_path):
     (data / "images" / "p_002.png").unlink()
     assert load_photos(data).names == ["p_001"]
     (data / "images" / "p_003.png").unlink()
-    with pytest.raises(DataError, match="frames with pictures in test_filenames, got 1 without"):
+    with pytest.raises(DataError, match="frames with images in test_filenames, got 1 without"):
         load_photos(data, "test")
 
 
@@ -89,4 +89,4 @@ def test_a_dot_in_a_name_is_no_ending(tmp_path):
         root["frames"][k]["file_path"] = f"images/p_0.{k}"
     (data / "images" / "p_0.png").write_bytes((data / "images" / "p_001.png").read_bytes())
     (data / "transforms.json").write_text(json.dumps(root))
-    assert "2 of 10 listed left out" in load_photos(data).about
+    assert "2 of 10 listed images left out" in load_photos(data).about

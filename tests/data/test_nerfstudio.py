@@ -70,10 +70,10 @@ def other_size(folder):
     ("change", "message"),
     [
         (root(camera_model="OPENCV_FISHEYE"), "frame 0: .*models .* got 'OPENCV_FISHEYE'"),
-        (root(w=24, h=18), r"frame 0: expected pictures of 24x18 pixels \(w and h\), got 12x8"),
+        (root(w=24, h=18), r"frame 0: expected images of 24x18 pixels \(w and h\), got 12x8"),
         (root(k1="x"), "frame 0: expected k1 between -inf and inf, got 'x'"),
-        (frame(mask_path="masks/none.png"), r"frame 1: no mask .*masks/none\.png \(mask_path\)"),
-        (frame(mask_path=7), "frame 1: no mask .*/7"),
+        (frame(mask_path="masks/none.png"), r"frame 1: the mask .*masks/none\.png .*\(mask_path\)"),
+        (frame(mask_path=7), "frame 1: the mask .*/7"),
         (root(test_filenames="p_000"), "expected test_filenames as a list of file_paths"),
         (root(test_filenames=[]), "frames of the file in test_filenames, got an empty list"),
         (root(test_filenames=["x/y.png"]), "frames of the file in test_filenames, got y"),

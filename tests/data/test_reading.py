@@ -226,7 +226,7 @@ def test_what_cannot_be_written_is_said_and_does_no_harm(data, tmp_path, caplog)
     caplog.set_level("INFO", "univoxel")
     photos = load_photos(data, downscale=2)
     keep_photos(photos, tmp_path / "nowhere" / "kept")
-    assert "photographs are not kept for the next time: " in caplog.text
+    assert "prepared photographs could not be stored " in caplog.text
     (tmp_path / "kept").mkdir()
     keep_photos(photos, tmp_path / "kept")
     assert same(load_photos(data, downscale=2, kept=tmp_path / "kept"), photos)

@@ -47,7 +47,7 @@ def test_pictures_that_are_not_there_and_names_with_folders(tmp_path):
     edited(("p_002.png", r"D:\shots\p_002.tif"))(tmp_path)
     photos = load_photos(tmp_path)
     assert photos.names[0] == "p_002"
-    assert "1 of 10 listed left out" in photos.about
+    assert "1 of 10 listed images left out" in photos.about
 
 
 def value(index, new):
@@ -77,12 +77,12 @@ def only_a_head(folder):
         (value(8, "3"), "line 5: expected cx between -12 and 24, got 42.0"),
         (value(12, "far"), "line 5: expected a number as k3, got 'far'"),
         (value(10, "0,0"), "line 5: expected 16 values, got 17"),
-        (only_a_head, "cameras.csv: expected a line for each camera, got none"),
+        (only_a_head, "cameras.csv: expected a line per camera, got none"),
         (
             lambda f: (f / "cameras.csv").write_bytes(SHORT.encode() + b"\n\xff"),
             "cameras.csv: expected text in UTF-8",
         ),
-        (lambda f: (f / "images").rename(f / "photos"), "cameras.csv: no picture p_000.png,"),
+        (lambda f: (f / "images").rename(f / "photos"), "cameras.csv: missing images: p_000.png,"),
     ],
 )
 def test_one_line_for_what_is_broken(tmp_path, damage, message):

@@ -131,15 +131,15 @@ def test_pixels_are_those_of_the_file(turned):
 
 def test_messages_say_that_pixels_are_not_turned(turned):
     """Cameras of photographs as viewers show them."""
-    note = r"; EXIF orientation 6 of p_001\.jpg is not applied"
+    note = "; the EXIF orientation 6 of p_001"
     cameras = turned / "sparse/0/cameras.txt"
     cameras.write_text(cameras.read_text().replace(f"{WIDTH} {HEIGHT}", f"{HEIGHT} {WIDTH}"))
-    with pytest.raises(DataError, match=r"expected 8x12 pixels .*, got 12x8; EXIF orientation 6"):
+    with pytest.raises(DataError, match=r"expected 8x12 pixels .*, got 12x8; the EXIF .* 6"):
         load_photos(turned)
     frames = [{"file_path": "images/p_001.jpg", "transform_matrix": np.eye(4).tolist()}]
     root = {"fl_x": FOCAL, "w": HEIGHT, "h": WIDTH, "frames": frames}
     (turned / "transforms.json").write_text(json.dumps(root))
-    with pytest.raises(DataError, match=r"pictures of 8x12 pixels \(w and h\), got 12x8" + note):
+    with pytest.raises(DataError, match=r"images of 8x12 pixels \(w and h\), got 12x8" + note):
         load_photos(turned)
 
 

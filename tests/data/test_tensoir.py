@@ -58,14 +58,14 @@ def two_lights(folder):
         (meta(cam_transform_mat="a,b"), "expected JSON with cam_transform_mat, numbers"),
         (meta(cam_transform_mat=[1.0]), "expected JSON with cam_transform_mat, numbers"),
         (meta(cam_angle_x=40), "expected cam_angle_x between 0 and 3.142, got 40"),
-        (meta(imw=13), r"metadata\.json: expected pictures of 13x8 pixels .*, got 12x8"),
+        (meta(imw=13), r"metadata\.json: expected images of 13x8 pixels .*, got 12x8"),
         (
             lambda f: (f / "train_001" / "metadata.json").write_text("{"),
-            "metadata.json: broken JSON",
+            "metadata.json: invalid JSON",
         ),
         (
             lambda f: [(f / f"train_00{v}" / "rgba_sunset.png").unlink() for v in range(5)],
-            r"no picture .*train_000/rgba_sunset\.png, .*, \.\.\.: 5 of 8 are missing",
+            r"missing images: .*train_000/rgba_sunset\.png, .* \(5 of 8\)",
         ),
         (two_lights, r"train_000: expected rgba\.png, .* got rgba_a\.png, rgba_b\.png"),
     ],

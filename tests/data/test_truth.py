@@ -71,7 +71,7 @@ def test_truth_that_is_not_there(tmp_path):
         ({"alpha": np.zeros(3, np.uint8)}, r"expected an array alpha \[H, W\]"),
         ({"albedo": np.zeros((HEIGHT, WIDTH))}, r"expected finite albedo of shape \[4, 6, 3\],"),
         ({"roughness": np.full((HEIGHT, WIDTH), np.nan)}, "expected finite roughness"),
-        ({"albedo": np.array([object()])}, "expected an npz file, could not read it: .*pickle"),
+        ({"albedo": np.array([object()])}, "this npz file could not be read: .*pickle"),
     ],
 )
 def test_broken_truth(tmp_path, change, message):
@@ -100,7 +100,7 @@ def test_relit_views(tmp_path):
 
 def test_broken_relit_views(tmp_path):
     (tmp_path / "relight" / "city").mkdir(parents=True)
-    with pytest.raises(DataError, match=r"city: expected its map .*city\.hdr, got nothing there"):
+    with pytest.raises(DataError, match=r"city: expected its environment map .*city\.hdr, but"):
         relight_maps(tmp_path)
     with pytest.raises(DataError, match=r"relight/city: no picture .*r_0"):
         load_relit(photos(tmp_path), "city")
@@ -122,7 +122,7 @@ def test_points(tmp_path):
         ({"vertices": np.eye(3)}, r"expected an array points \[P, 3\], got vertices \[3, 3\]"),
         ({"points": np.zeros((2, 2))}, r"got points \[2, 2\]"),
         ({"points": np.zeros((0, 3))}, r"got points \[0, 3\]"),
-        ({"points": np.full((2, 3), np.inf)}, "points hold NaN or infinity"),
+        ({"points": np.full((2, 3), np.inf)}, "points contain NaN or infinity"),
         ({}, "got no arrays"),
     ],
 )
@@ -209,8 +209,8 @@ def test_truth_is_shrunk_by_coverage(tmp_path):
 @pytest.mark.parametrize(
     ("file", "picture", "message"),
     [
-        ("albedo", gray(1, width=5), "expected 6x4 pixels like the photograph's, got 5x4"),
-        ("normal", gray(1)[..., 0], "expected a picture with 3 or 4 channels, got 1"),
+        ("albedo", gray(1, width=5), "expected 6x4 pixels as in the photograph, got 5x4"),
+        ("normal", gray(1)[..., 0], "expected an image with 3 or 4 channels, got 1"),
     ],
 )
 def test_broken_pictures_of_truth(tmp_path, file, picture, message):

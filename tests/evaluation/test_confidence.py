@@ -101,7 +101,7 @@ def test_clipped_and_black_pixels_say_nothing(scene):
         assert (share[seen] == 1).all()
         assert (surveyed.straight == 0).all()
         assert (surveyed.albedo == 1).all()
-    assert "clipped in most photographs" in words(numbers(bright), [])
+    assert "overexposed in most photographs" in words(numbers(bright), [])
     assert "black in most photographs" in words(numbers(dark), [])
 
 
@@ -179,10 +179,10 @@ def test_words_leave_out_what_is_not_the_case(surveyed):
     still = replace(surveyed, disagreement=agreeing, views=views)
     figures = numbers(still)
     said = words(figures, [])
-    assert said.startswith("Doubt of albedo 0.")
+    assert said.startswith("Uncertainty of the albedo 0.")
     assert "cameras" not in said
     assert "differs" not in said
-    assert "a factor that photographs cannot fix" in said
+    assert "Photographs cannot separate the brightness" in said
     assert "trouble" not in said
     assert "trouble 2 times, the last in stage 1: b." in words(figures, ["a", "stage 1: b"])
 

@@ -6,13 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from analytic import cameras_around, hull_of, sphere_scene
-from observed_points import (
-    lamps,
-    no_metal,
-    photographs_under,
-    problem_on_a_sphere,
-    random_problem,
-)
+from observed_points import lamps, no_metal, photographs_under, problem_on_a_sphere, random_problem
 from torch.nn.functional import normalize
 
 from univoxel import brdf
@@ -166,7 +160,7 @@ def test_photographs_tell_of_a_flash(photographs, caplog):
     told = light_frame_of(photos, *hull_of(photos), "auto")
     assert told.turntable is None
     assert told.flash == pytest.approx(2.0, abs=0.3)
-    assert "a flash at the camera lit the object" in caplog.text
+    assert "light: a flash at the camera" in caplog.text
     photos = photographs["room"]
     assert light_frame_of(photos, *hull_of(photos), "camera").flash is not None
     assert light_frame_of(photographs["flash"], *hull_of(photos), "world") == LightFrame()

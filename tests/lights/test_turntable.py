@@ -152,9 +152,9 @@ def test_level_cameras_on_an_inclined_circle_were_carried_around_it():
 
 
 def test_axis_and_start_are_across():
-    with pytest.raises(ConfigError, match="axis and start must be unit vectors across each other"):
+    with pytest.raises(ConfigError, match="axis and start must be perpendicular unit vectors"):
         Turntable((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.6, 0.8))
-    with pytest.raises(ConfigError, match="axis and start must be unit"):
+    with pytest.raises(ConfigError, match="axis and start must be perpendicular"):
         Turntable((0.0, 0.0, 0.0), (0.0, 0.0, 2.0), (1.0, 0.0, 0.0))
     one = (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
     with pytest.raises(ConfigError, match="each of several tables needs the eyes of its cameras"):

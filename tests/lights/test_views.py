@@ -131,5 +131,5 @@ def test_one_light_for_all_has_no_views():
     assert scene.views is None
     features = torch.zeros(2, 4)
     assert scene.coded(features) is features
-    with pytest.raises(ValueError, match="light_of: all views of this run have one light"):
+    with pytest.raises(ValueError, match="light_of: expected a run trained with varying light"):
         scene.show_light_of("left")

@@ -7,12 +7,7 @@ import torch
 from check_op import check_op
 
 from univoxel import sphere
-from univoxel.ops import (
-    shade_map,
-    shade_map_reference,
-    shade_radiance,
-    shade_radiance_reference,
-)
+from univoxel.ops import shade_map, shade_map_reference, shade_radiance, shade_radiance_reference
 from univoxel.ops.shade import _shade_radiance
 
 # Above check_op's common bound: sums of a few hundred directions, and D's denominator at low

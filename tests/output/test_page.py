@@ -314,7 +314,7 @@ def test_training_names_its_page(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr("univoxel.output.page.write_page", lambda run, path: path)
     with caplog.at_level(logging.INFO, "univoxel"):
         with_page(tmp_path)
-    assert caplog.messages == [f"to look at, in a browser: {tmp_path / 'index.html'}"]
+    assert caplog.messages == [f"Page: open {tmp_path / 'index.html'}"]
 
 
 def test_a_notebook_shows_the_page(scene, tmp_path, monkeypatch):

@@ -131,7 +131,7 @@ def test_photographs_stand_beside_their_render_the_worst_first(run, text):
 
 def test_doubt_is_painted_and_told(text):
     said = section(text, "Doubt")
-    assert "Doubt of albedo 0." in said
+    assert "Uncertainty of the albedo 0." in said
     names = [name for name, _ in pictures(said)]
     assert names == ["front", "right", "back", "left"]
 
@@ -139,7 +139,7 @@ def test_doubt_is_painted_and_told(text):
 def test_light_of_a_run_without_a_map(text):
     said = section(text, "Light")
     assert "no environment map: its light is local (sg)" in said
-    assert [name for name, _ in pictures(said)] == ["map", "grey ball", "mirror ball"]
+    assert [name for name, _ in pictures(said)] == ["map", "diffuse sphere", "chrome sphere"]
 
 
 def test_the_map_of_lobes_that_are_everywhere_the_same_is_their_sum():
@@ -193,7 +193,7 @@ def test_training_is_told(run, text):
     assert said.count('<svg class="chart"') in (0, 2)  # of seconds: there may be no line of the log
     assert "1: coarse shape<td>20<td>100%" in said
     assert "whole" in said
-    assert "The limit was 120 s." in said
+    assert "The time limit was 120 s." in said
     _, state = load_checkpoint(run.path)
     assert len(state["took"]) == 2
     assert report.prepared(state) + sum(state["took"]) <= state["seconds"] + 1e-6
@@ -205,14 +205,15 @@ def test_what_time_cut_is_told(tmp_path):
     state |= {"took": [10.0, 20.0, 15.0], "stage_took": 5.0, "seconds": 57.0, "troubles": ["a"]}
     facts = report.stages(cfg, state)
     assert [f.fate for f in facts] == [
-        *("whole", "cut by the time limit", "ended early: nothing was left to gain", "not ended")
+        "whole",
+        *("shortened by the time limit", "ended early, because it stopped improving", "not ended"),
     ]
     assert [f.seconds for f in facts] == [10.0, 20.0, 15.0, None]
     assert [f.name for f in facts][2:] == ["materials and light", "polish"]
     assert report.prepared(state) == pytest.approx(7.0)
     assert report.stage_ends(state) == pytest.approx([17.0, 37.0])
     told = report.remarks(cfg, state)
-    assert told[0] == "Training has not ended: it stands in stage 4."
+    assert told[0] == "Training has not ended: it is in stage 4."
     assert "of the planned steps it made 40% for shape" in told[1]
     assert "trouble 1 times, the last in a." in told[2]
     assert report.stage_ends({}) == []
@@ -253,12 +254,12 @@ def test_a_run_whose_photographs_are_gone_shows_what_is_left(run, data, tmp_path
     scene, state = load_checkpoint(moved)
     text = report_text(moved, scene, state, ReportOptions(size=SIZE))
     said = section(text, "What to photograph next")
-    assert "The photographs cannot be read, so this is left out: " in said
+    assert "The photographs could not be read, so this part is missing: " in said
     assert "gone" in said
     assert re.findall(r"<h2>(.*?)</h2>", text) == [
         *("Result", "What to photograph next", "Materials", "Light", "Training")
     ]
-    assert "no log of this training" in text
+    assert "This training has no log" in text
     # Where they are now
     whole = report_text(moved, scene, state, ReportOptions(size=SIZE, data=data, views=0))
     assert "<li>" in section(whole, "What to photograph next")
@@ -266,7 +267,7 @@ def test_a_run_whose_photographs_are_gone_shows_what_is_left(run, data, tmp_path
         report_text(moved, scene, state, ReportOptions(data=tmp_path / "gone"))
     (moved / "config.json").write_text("{")
     text = report_text(moved, scene, state, ReportOptions(size=SIZE))
-    assert "stages are not told" in text
+    assert "stages are missing" in text
 
 
 def test_metal_is_a_layer_where_there_is_any(tmp_path):
@@ -277,11 +278,11 @@ def test_metal_is_a_layer_where_there_is_any(tmp_path):
             return features[:, :3], features[:, 3], torch.ones(len(features))
 
     plain = report_text(tmp_path, scene, {}, ReportOptions(size=SIZE))
-    assert "Nothing is metal." in plain
+    assert "No metal was found." in plain
     scene.material = Metal()
     shown = report_text(tmp_path, scene, {}, ReportOptions(size=SIZE))
     assert "Metal: white is metal." in shown
-    assert "Nothing is metal." not in shown
+    assert "No metal was found." not in shown
 
 
 def test_a_training_that_was_cancelled_is_shown_too(data, tmp_path, monkeypatch):
@@ -294,13 +295,10 @@ def test_a_training_that_was_cancelled_is_shown_too(data, tmp_path, monkeypatch)
     cfg = preset("draft", data, tmp_path / "run", "sg")
     small = [replace(s, voxels=0.01, rays=64, iterations=5) for s in cfg.stages]
     with pytest.raises(univoxel.Cancelled):
-        train(
-            replace(cfg, stages=tuple(small), voxel_pixels=0.0, **GIVEN),
-            on_progress=cancel,
-        )
+        train(replace(cfg, stages=tuple(small), voxel_pixels=0.0, **GIVEN), on_progress=cancel)
     text = univoxel.open_run(tmp_path / "run").report(size=SIZE, views=0).read_text()
     said = section(text, "Training")
-    assert "Training has not ended: it stands in stage 2." in said
+    assert "Training has not ended: it is in stage 2." in said
     assert said.count('<svg class="chart"') == 2
 
 
@@ -312,7 +310,7 @@ def test_by_the_command_line(run, capfd, tmp_path):
     assert "<h1>One</h1>" in text
     assert len(pictures(section(text, "Photographs and render"))) == 3
     for arguments, message in (
-        ([str(tmp_path)], f"no checkpoint in {tmp_path}"),
+        ([str(tmp_path)], f"not a trained run {tmp_path}"),
         ([str(run.path), "--views", "-1"], "--views must be at least 0, got -1"),
         ([str(run.path), "--html", "a.pdf"], "--html: expected a file that ends in .html, got"),
         ([str(run.path), "--data", str(tmp_path / "none")], "none"),
@@ -326,7 +324,7 @@ def test_by_the_command_line(run, capfd, tmp_path):
 def test_mistakes(tmp_path):
     with pytest.raises(UserError, match="size must be at least 16, got 8"):
         ReportOptions(size=8)
-    with pytest.raises(MissingFile, match="no checkpoint"):
+    with pytest.raises(MissingFile, match="not a trained run"):
         univoxel.open_run(tmp_path).report()
     empty = sphere_scene(0)
     with torch.no_grad():

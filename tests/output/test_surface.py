@@ -184,7 +184,7 @@ def test_without_photographs_nothing_is_smoothed(tmp_path, caplog):
     caplog.set_level(logging.INFO, logger="univoxel")
     scene = lopsided(24**3)
     assert cameras_of(scene, tmp_path) is None
-    assert "mesh: nothing is smoothed" in caplog.text
+    assert "mesh: not smoothed" in caplog.text
     assert surface_of(scene, None).seen is None
 
 

@@ -63,7 +63,7 @@ def test_nothing_left_is_an_error():
         Mesh(torch.empty(0, 3), torch.empty(0, 3).int()),
         Mesh(CORNERS, torch.tensor([[0, 0, 1]]).int()),
     ):
-        with pytest.raises(ValueError, match="no part that encloses volume"):
+        with pytest.raises(ValueError, match="no part that encloses a volume"):
             clean(mesh)
 
 

@@ -102,7 +102,7 @@ def test_a_silhouette_cut_by_the_border_says_nothing_beyond_it(silhouettes):
 
 def test_no_common_volume_is_an_error(silhouettes):
     distance, cameras = silhouettes
-    with pytest.raises(ValueError, match="silhouettes of the photographs share no volume"):
+    with pytest.raises(ValueError, match="silhouettes of the photographs have no common volume"):
         hull.estimate_bounds(torch.full_like(distance, 5.0), cameras)
 
 

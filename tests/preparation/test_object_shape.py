@@ -66,7 +66,7 @@ def test_boxes_that_are_none_or_hold_nothing():
             box_corners(values)
     cameras = cameras_around(12, 32)
     masks, box = [true_mask(cameras, v) for v in range(12)], box_corners((1, 1, 1, 1.2, 1.2, 1.2))
-    with pytest.raises(UserError, match=r"that the object lies in, got 1 1 1 .*cameras look at"):
+    with pytest.raises(UserError, match=r"around the object, got 1 1 1 .*cameras look at"):
         find_object(masks, without_depth(cameras), VOXELS, box)
 
 

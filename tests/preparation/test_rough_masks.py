@@ -12,11 +12,7 @@ from univoxel.data import Photos
 from univoxel.errors import DataError
 from univoxel.preparation import pose_refinement, prepare
 from univoxel.preparation.hull import hull_sdf, mask_distances
-from univoxel.preparation.pose_refinement import (
-    MAX_CONTRADICTION,
-    Belief,
-    choose_masks_or_poses,
-)
+from univoxel.preparation.pose_refinement import MAX_CONTRADICTION, Belief, choose_masks_or_poses
 from univoxel.preparation.rough_masks import doubt_masks, thick
 from univoxel.presets import preset
 
@@ -98,7 +94,7 @@ def test_of_plain_objects_silhouettes_alone_tell_masks_from_cameras(photos, capl
         found = choose_masks_or_poses(spoilt, distance, "auto", "auto")
     assert not found.refined
     assert found.votes > 1
-    assert "no better with other cameras: the masks are rough" in caplog.text
+    assert "no better with other cameras: the masks are taken to be rough" in caplog.text
     # What is told is believed
     assert choose_masks_or_poses(spoilt, distance, "refined", "auto").refined
     assert choose_masks_or_poses(spoilt, distance, "auto", "given").refined
@@ -115,7 +111,7 @@ def test_jagged_edges_are_not_doubted():
 
 def test_silhouettes_in_which_nothing_lies(photos, tmp_path):
     cfg = preset("fast", tmp_path / "data", tmp_path / "run")
-    with pytest.raises(DataError, match=r"data: .*(share no volume|nothing in common)"):
+    with pytest.raises(DataError, match=r"data: .*(have no common volume|nothing in common)"):
         prepare.find_silhouettes(replace(photos, alpha=torch.zeros_like(photos.alpha)), cfg)
 
 
@@ -129,7 +125,7 @@ def test_preparation_doubts_what_contradicts_and_starts_from_what_agrees(
     cfg = preset("fast", tmp_path, tmp_path / "run")
     with caplog.at_level("INFO"):
         found = prepare.find_silhouettes(spoilt, cfg)
-    assert "of the pixels are doubted" in caplog.text
+    assert "of the pixels are uncertain" in caplog.text
     assert found.shape is not None
     assert found.doubted.any()
     assert not found.edges_given

@@ -88,9 +88,9 @@ def test_a_failure_that_stays_ends_its_stage(data, tmp_path, monkeypatch):
     told = events(out)
     assert len(told) == 2 * (LIMIT + 1)
     assert "dropped this step" in told[0]
-    assert all("went back to the last good state" in t for t in told[1:LIMIT])
+    assert all("returned to the last good state" in t for t in told[1:LIMIT])
     assert told[LIMIT].startswith(f"stage 1, step {7 + LIMIT}:")
-    assert told[LIMIT].endswith("the stage ends with the last state that was good")
+    assert told[LIMIT].endswith("the stage ends with the last good state")
     assert told[-1].startswith("stage 2,")
     assert len(calls) == 7 + 2 * (LIMIT + 1)
     assert finite(load_scene(out))
@@ -128,8 +128,8 @@ def test_a_collapse_goes_back(data, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "held_out_psnr", judged)
     out = task.train(small(data, tmp_path / "run"))
     (told,) = events(out)
-    assert "held-out quality is" in told
-    assert "dB at best; went back to the last good state" in told
+    assert "validation PSNR is" in told
+    assert "dB at best; returned to the last good state" in told
     # One step, of half the length, lies between what came back and the next look
     assert (states[10] - states[8]).abs().max() < 0.5 * (states[8] - states[0]).abs().max()
     lines = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
@@ -182,7 +182,7 @@ def test_a_surface_that_no_photograph_sees_leaves_light_and_materials():
     photos = dataclasses.replace(photos, alpha=torch.zeros_like(photos.alpha))
     joint_solve.solve(scene, photos, JOINT, 0, steps)
     assert steps.asked == ["skip"]
-    assert "no photograph sees a point of the surface" in steps.troubles[0]
+    assert "no surface point is seen in any photograph" in steps.troubles[0]
 
 
 @pytest.fixture
@@ -237,7 +237,7 @@ def test_quality_of_another_kind_is_no_collapse(followed):
     watch.judge(25.0, False)
     assert not steps.troubles
     watch.judge(18.0, False)
-    assert "held-out quality is 18.0 dB, 25.0 dB at best" in steps.troubles[0]
+    assert "validation PSNR is 18.0 dB, 25.0 dB at best" in steps.troubles[0]
 
 
 def test_quality_beyond_need_may_fall(followed):
@@ -246,7 +246,7 @@ def test_quality_beyond_need_may_fall(followed):
         watch.judge(psnr, False)
     assert not steps.troubles
     watch.judge(float("nan"), False)
-    assert "held-out quality is nan dB, 40.0 dB at best" in steps.troubles[0]
+    assert "validation PSNR is nan dB, 40.0 dB at best" in steps.troubles[0]
 
 
 def test_a_copy_of_another_grid_is_not_taken(followed):
@@ -269,7 +269,7 @@ def test_a_copy_that_is_forgotten_is_not_taken(followed):
     watch.forget()
     watch.judge(1.0, False)
     assert number.item() == before
-    assert "there is no state to go back to" in steps.troubles[0]
+    assert "there is no earlier state" in steps.troubles[0]
 
 
 def test_a_system_is_damped_only_as_it_needs():

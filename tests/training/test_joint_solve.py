@@ -299,8 +299,8 @@ def test_training_says_and_keeps_that_there_is_nothing_but_metal(events, monkeyp
     )
     events(told, whole=True)
     assert kept == [True] * 4  # for a run that goes on within the stage
-    assert told.said[0].startswith("the whole object is taken for metal")
-    assert told.said[0].endswith("see --metal")
+    assert told.said[0].startswith("the whole object is classified as metal")
+    assert told.said[0].endswith("use --metal some")
     told = Steps(4)
     events(told, only_metal=True)
     assert not told.said  # it was asked for

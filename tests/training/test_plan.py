@@ -108,7 +108,7 @@ def test_resume_goes_on_with_what_was_chosen(data, tmp_path, monkeypatch):
         train(cfg)
     fits = compression.fit_grid(*load_scene(cfg.out).field.bounds(), 50_000).nodes_count
     assert counts[1] < fits
-    with pytest.raises(ValueError, match="the run began with other budget_mb"):
+    with pytest.raises(ValueError, match="the run was started with another budget_mb"):
         train(dataclasses.replace(cfg, budget_mb=1.0), resume=True)
     seen = []
     monkeypatch.setattr(task, "run_stage", lambda scene, *_: seen.append(scene.field.grid))

@@ -92,7 +92,7 @@ def test_a_view_that_fails_is_told_once_and_training_goes_on(
     monkeypatch.setattr(module, "frame", fail)
     assert_same(plain, train(three_stages(data, tmp_path / "run"), view=ANY))
     assert looking.pictures == []
-    assert caplog.text.count("training goes on") == 1
+    assert caplog.text.count("training continues") == 1
     assert caplog.text.count("RuntimeError: no such picture") == 1
 
 
@@ -150,7 +150,7 @@ def test_a_training_is_ended_from_a_browser(data, tmp_path, looking, caplog):
     assert state["made"][0] < 0.5
     assert state["made"][1:] == [1.0, 1.0]
     assert len(scene.field.isosurface()[0]) > 100
-    assert "Doubt of albedo" in (run / "trust.txt").read_text()
+    assert "Uncertainty of the albedo" in (run / "trust.txt").read_text()
     assert "Result: unfinished, it was stopped: of the planned steps it made" in caplog.text
 
 

@@ -1,1 +1,1 @@
-"""Many scenes: jobs on one machine or on many, and what came out of them."""
+"""Processing of many scenes: jobs on one machine or a cluster, and their results."""

@@ -1,4 +1,4 @@
-"""Jobs: their steps as command lines, their records, and workers of Dask that run them."""
+"""Jobs: steps as command lines, their records, and the Dask workers that run them."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class Job:
         path = self.file(".json")
         found = read_json(path) if path.exists() else {}
         if not isinstance(found, dict) or any(type(found.get(k, {})) is not dict for k in RECORD):
-            raise DataError(f"{path}: expected the record of a job: remove it")
+            raise DataError(f"{path}: not a record of a job: remove the file")
         return {key: found.get(key, {}) for key in RECORD}
 
     def save(self, record: dict[str, dict[str, Any]]) -> None:
@@ -92,11 +92,11 @@ class Job:
         write_json(self.file(".json"), record)
 
     def check_same(self) -> None:
-        """Refuse, by an ExistingFile, to go on with what other options began."""
+        """Refuse, by an ExistingFile, to continue with what other options began."""
         before = self.record()["identity"]
         other = [key for key, value in self.identity.items() if before and before.get(key) != value]
         if other:
-            where = f"{self.name}: {self.file('.json')} is of another {' and '.join(other)}"
+            where = f"{self.name}: {self.file('.json')} has another {' and '.join(other)}"
             hint = "choose another out, or remove that file and the folder of its results"
             raise ExistingFile(f"{where}: {hint}", "out")
 
@@ -141,11 +141,11 @@ def _steps(job: Job, watch: Callable[[Step], None]) -> tuple[Any, dict[str, str]
         code, said = _run(job, step, watch)
         seconds[step.name] = seconds.get(step.name, 0.0) + time.monotonic() - begin
         if (cause := system.ended_by(code)) is not None:
-            errors[step.name] = f"ended by {cause}, as the system does where memory is short"
+            errors[step.name] = f"ended by {cause}; the system does that if memory runs out"
         elif code:
             errors[step.name] = said or f"ended with exit code {code}"
         elif step.makes is not None and not step.makes.exists():
-            errors[step.name] = f"ended well and left no {step.makes}"
+            errors[step.name] = f"ended without an error, but {step.makes} is missing"
         job.save(record)
         if cause is not None:
             return "killed", errors
@@ -181,7 +181,7 @@ def last_line(log: Path | None) -> dict[str, Any]:
     return {}
 
 
-# Jobs on workers of Dask: those of this machine alone, or of a cluster that is there.
+# Jobs on workers of Dask: those of this machine only, or of a cluster that is there.
 
 
 TICK_SECONDS = 0.25
@@ -208,7 +208,7 @@ def connect(jobs: int, scheduler: str | None = None) -> Iterator[Client]:
         from distributed import Client
     except ImportError:
         raise MissingExtra(
-            "many scenes are shared out by Dask, which is missing: pip install 'univoxel[cluster]'"
+            "processing many scenes needs Dask: pip install 'univoxel[cluster]'"
         ) from None
     with contextlib.ExitStack() as stack:
         for name in ("distributed", "tornado.application", "asyncio"):  # what matters is told here
@@ -315,13 +315,13 @@ def _result(future: Any, job: Job) -> Result:
     from distributed import KilledWorker
 
     if future.status in ("lost", "cancelled"):
-        raise ProcessFailed("the scheduler is gone: the same command goes on")
+        raise ProcessFailed("the scheduler was lost: run the same command again to resume")
     error = future.exception()
     if error is None:
         return future.result()
     if isinstance(error, KilledWorker):
-        return Result(job.name, "failed", {"worker": "every worker that took it died"})
-    raise ProcessFailed(f"a worker has another univoxel than this, or none: {error}") from error
+        return Result(job.name, "failed", {"worker": "every worker that took this scene died"})
+    raise ProcessFailed(f"a worker has no univoxel, or another version of it: {error}") from error
 
 
 class ProgressTable:

@@ -1,4 +1,4 @@
-"""Many scenes as jobs: the steps of each, what came out of them, and a page of it."""
+"""Scenes as jobs: the steps of each, their results, and a web page of all."""
 
 from __future__ import annotations
 
@@ -43,15 +43,15 @@ def named(scenes: Sequence[Path]) -> dict[str, Path]:
     for path in (scene.resolve() for scene in scenes):
         name = path.stem if path.is_file() else path.name
         if not path.exists():
-            raise UserError(f"{path}: expected a scene, got nothing there")
+            raise UserError(f"{path}: expected a scene, but the folder does not exist")
         if name == LOGS or name.startswith("."):
-            raise UserError(f"{path}: expected another name than {name!r}: rename the folder")
+            raise UserError(f"{path}: a scene cannot be named {name!r}: rename the folder")
         if name in found:
             both = f"{found[name]} and {path}"
-            raise UserError(f"expected scenes in folders of different names, got {both}")
+            raise UserError(f"expected scene folders with different names, got {both}")
         found[name] = path
     if not found:
-        raise UserError("expected a scene, a folder of photographs, or more; got none")
+        raise UserError("expected at least one scene, a folder of photographs, got none")
     return found
 
 
@@ -108,7 +108,7 @@ class SceneResult:
     errors: dict[str, str]  # a line each, by step
     seconds: dict[str, float]  # spent in all sittings, by step
     verdict: Word | None = None  # None: it was not trained to an end
-    measures: dict[str, float | int | None] = field(default_factory=dict)  # as of `evaluate`
+    measures: dict[str, float | int | None] = field(default_factory=dict)  # as in `evaluate`
     doubts: dict[str, float] = field(default_factory=dict)  # means over the surface, in [0, 1]
 
     @property
@@ -183,7 +183,7 @@ def write_sheet(results: Sequence[SceneResult], out: Path) -> Path:
     """Write out/index.html, which holds its pictures; return it. Failed scenes come first."""
     shown = [key for key in COLUMNS if any(r.measures.get(key) is not None for r in results)]
     heads = ["", "scene", "verdict", *(COLUMNS[key][0] for key in shown)]
-    heads += ["doubt of albedo", "of roughness", "training", "all", ""]
+    heads += ["albedo uncertainty", "roughness uncertainty", "training", "all", ""]
     ordered = sorted(results, key=lambda r: (WORSE_FIRST[r.state], r.name))
     counts = [(state, sum(r.state == state for r in results)) for state in WORSE_FIRST]
     about = ", ".join(f"{count} {state}" for state, count in counts if count)
@@ -202,7 +202,7 @@ def _row(result: SceneResult, shown: Sequence[str], out: Path) -> list[str]:
     cells += [_number(result.doubts.get(key), 2) for key in ("doubt_albedo", "doubt_roughness")]
     whole = sum(result.seconds.values()) if result.seconds else None
     cells += [_number(spent, 0, " s") for spent in (result.seconds.get("train"), whole)]
-    output = _link(out / LOGS / f"{result.name}.txt", "what it said", out)
+    output = _link(out / LOGS / f"{result.name}.txt", "error message", out)
     return [*cells, f"{escape(result.error)} {output}"]
 
 

@@ -1,2 +1,1 @@
-"""Photographs in, cameras and masks out: reading of any format, structure from motion, masks,
-what may be wrong."""
+"""From photographs to cameras and masks: image reading, structure from motion, masks, checks."""

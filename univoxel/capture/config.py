@@ -1,4 +1,4 @@
-"""What may be chosen of finding cameras."""
+"""Settings of the search for cameras."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ class CaptureConfig:
     """
 
     size: int = setting(
-        FEATURE_SIZE, "along the longer side in which features are sought", unit="pixels", least=64
+        FEATURE_SIZE, "longer side at which features are detected", unit="pixels", least=64
     )
-    features: int = setting(4096, "largest number of a photograph", least=64)
+    features: int = setting(4096, "maximum number of features per photograph", least=64)
     first_octave: int = setting(
         -1,
-        "octave of the scale space that features begin in: -1 doubles the picture first. 0 costs a "
-        "quarter and loses photographs of smooth objects",
+        "first octave of the scale space: -1 doubles the image first; 0 takes a quarter of the "
+        "time and loses photographs of smooth objects",
         least=-1,
     )
-    seed: int = setting(0, "of all random choices", least=0)
+    seed: int = setting(0, "random seed", least=0)
     exhaustive: int = setting(
         24,
-        "up to so many photographs all pairs are matched; beyond, those chosen by a coarse look",
+        "photographs up to which all pairs are matched; beyond, a coarse comparison selects them",
         least=2,
     )
-    partners: int = setting(16, "best ones of each photograph that are matched in full", least=1)
+    partners: int = setting(16, "pairs per photograph that are matched in full", least=1)
 
     __post_init__ = check_settings
 

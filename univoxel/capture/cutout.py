@@ -1,4 +1,4 @@
-"""Objects cut out of photographs without masks, and their masks to look through."""
+"""Masks for photographs whose cameras are known, and a page to check them."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def write_page(path: Path, tiles: Sequence[MaskTile], about: str) -> None:
         words = escape(f"{tile.name}{_number(tile)} {tile.fault}")
         images = [image(picture) for picture in (tile.before, tile.after) if picture is not None]
         kind = ' class="wrong"' if tile.fault else ""
-        repaired = "" if tile.after is None else "; repaired on the right"
+        repaired = "" if tile.after is None else "; corrected on the right"
         caption = f"<figcaption>{words}{repaired}</figcaption>"
         figures.append(f"<figure{kind}>{''.join(images)}{caption}</figure>")
     main = "\n".join(["<main>", *figures, "</main>"])
@@ -139,7 +139,7 @@ PHOTOGRAPHS = 12
 # Voxels along a side of the grid whose silhouettes are masks themselves, and pixels that they are
 # wide at most
 FINE, WIDTH = 128, 500
-# Share of the object's surface that depth shows, below which depth alone has guessed its shape
+# Share of the object's surface that depth shows, below which depth only has guessed its shape
 GUESSED = 0.15
 # Share of the object's surface that depth has to show for it to be believed against most masks
 SURE = 0.5
@@ -159,33 +159,32 @@ def cutout(
     box: Sequence[float] | None = None,
     keep_table: bool = False,
 ) -> Path:
-    """Write the photographs of a data set with masks as their alpha, and their cameras; return out.
+    """Write the photographs of a data set with an alpha channel, and their cameras; return out.
 
-    All splits are written, in the layout of NeRF-synthetic scenes, without lens distortion, beside
-    masks.png and masks.html, which show the masks, worst first. The object is found from the
-    training photographs alone.
+    All splits are written, in the layout of NeRF-synthetic scenes and without lens distortion.
+    masks.png and masks.html show the masks, worst first. The object is found from the training
+    photographs only.
 
     Args:
-        out: folder to write.
-        source: where masks come from: rembg, from a network; none, from depth alone, of what
-            stands out from its support in the middle; else a folder of masks.
-        downscale: side of the squares of pixels that become one, 0 as of `load_photos`.
-        allow_outside: as of `load_photos`.
-        network: which of rembg's networks makes them, if one does.
-        box: X0 Y0 Z0 X1 Y1 Z1, world units of the written cameras: what lies outside is not the
-            object.
-        keep_table: whether what stands out in depth keeps its support, within the box.
+        out: folder to write to.
+        source: source of the masks: rembg, a network; none, depth only, which finds the object
+            that stands on a table in the middle; else a folder of masks.
+        downscale: photographs are reduced to 1/N; 0: as in `load_photos`.
+        allow_outside: as in `load_photos`.
+        network: rembg's network to use.
+        box: X0 Y0 Z0 X1 Y1 Z1, a box around the object in the world of the written cameras.
+        keep_table: with masks from depth, keep the table inside the box.
 
     Raises:
-        DataError: photographs or masks that cannot be used, or nothing stands out in depth.
-        ExistingFile: out is there already.
-        MissingExtra: there is no network.
-        UserError: the masks have nothing in common, or arguments contradict one another.
+        DataError: photographs or masks cannot be used, or depth separates no object.
+        ExistingFile: out exists already.
+        MissingExtra: the network is not installed.
+        UserError: the masks have nothing in common, or arguments are inconsistent.
         OSError: a file cannot be written.
     """
     data, out, origin = Path(data), Path(out), str(source)
     if out.exists():
-        raise ExistingFile(f"{out} is there already: choose another out", "out")
+        raise ExistingFile(f"{out} exists already: choose another out", "out")
     check_masks(origin, network, box, keep_table)
     corners = None if box is None else object_shape.box_corners(box)
     masked = mask_network(network) if origin == REMBG else None
@@ -203,7 +202,7 @@ def cutout(
     else:  # of shrunk photographs those with masks are black outside of them
         masks = _as_read({n: load(n, photos.downscale, masks=Path(origin)) for n in splits})
     if origin == DEPTH:  # silhouettes have nothing to say against themselves
-        verdicts, told = _as_they_are(masks), "masks of the object that stands out in depth"
+        verdicts, told = _as_they_are(masks), "masks from depth"
     else:
         masks = masks if corners is None else _within(splits, masks, corners)
         verdicts, told = _judged(splits, masks, corners)
@@ -212,7 +211,7 @@ def cutout(
 
 
 def check_masks(origin: str, network: str, box: Sequence[float] | None, keep_table: bool) -> None:
-    """Refuse, by a UserError, choices of masks that contradict one another.
+    """Refuse, by a UserError, choices of masks that are inconsistent.
 
     Args:
         origin: where masks come from.
@@ -220,8 +219,8 @@ def check_masks(origin: str, network: str, box: Sequence[float] | None, keep_tab
     check_network(network)
     if network != NETWORK and origin not in (REMBG, "auto"):
         raise UserError(
-            f"network={network} makes masks where none are given: expected masks from {REMBG}, "
-            f"got {origin}",
+            f"network={network} is used only if masks are made: expected masks from {REMBG}, got "
+            f"{origin}",
             "network",
         )
     if box is not None:
@@ -229,8 +228,8 @@ def check_masks(origin: str, network: str, box: Sequence[float] | None, keep_tab
     if keep_table and (box is None or origin != DEPTH):
         got = "no box" if box is None else f"masks from {origin}"
         raise UserError(
-            f"keep_table: expected masks from {DEPTH}, depth alone, and a box that ends the table, "
-            f"got {got}",
+            f"keep_table needs masks from depth ({DEPTH}) and a box in which the table ends, got "
+            f"{got}",
             "keep_table",
         )
 
@@ -241,17 +240,17 @@ def _from_depth(
     """Masks of what stands out in depth."""
     small = masks_by_depth(maps, box, keep_table)
     if small is None and box is not None:
-        raise object_shape.nothing_inside(box, "depth shows next to no surface", maps.cameras)
+        raise object_shape.nothing_inside(box, "depth covers no surface", maps.cameras)
     shape = None if small is None else object_shape.find_object(small, maps, FINE, box)
     if shape is None or shape.surface < GUESSED:
         raise DataError(
-            f"{splits['train'].folder}: no object that stands out in depth was found; it needs "
-            f"texture, and cameras all around: expected source={REMBG} or a folder of masks, got "
-            f"{DEPTH}",
+            f"{splits['train'].folder}: depth separates no object from its surroundings. Depth "
+            f"needs texture, and cameras all around the object: use source={REMBG} or a folder "
+            f"of masks instead of {DEPTH}",
             "source",
         )
     _tell_evidence(shape, 0, box)
-    log.info("masks: of the object that stands out in depth; look at masks.html")
+    log.info("masks: made from depth; check masks.html")
     return {name: _silhouettes_of(shape, split) for name, split in splits.items()}
 
 
@@ -277,7 +276,7 @@ def _tell_evidence(shape: object_shape.ObjectShape, count: int, box: Tensor | No
     lower, upper = (
         object_shape.words_of(corner.tolist()) for corner in object_shape.inside_bounds(shape)
     )
-    log.info(f"the object is told by {', '.join(by)}; it lies between {lower} and {upper}")
+    log.info(f"the object was found by {', '.join(by)}; it spans {lower} to {upper}")
 
 
 def _silhouettes_of(shape: object_shape.ObjectShape, photos: Photos) -> list[Tensor]:
@@ -325,13 +324,13 @@ def _judged(
         for name, split in splits.items():
             for stem, one in zip(split.names, masks[name], strict=True):
                 if not bool((one >= 128).any()):
-                    where = "" if box is None else " in the box"
-                    raise DataError(f"{split.folder}: the mask of {stem} shows nothing{where}")
+                    where = "" if box is None else " inside the box"
+                    raise DataError(f"{split.folder}: the mask of {stem} is empty{where}")
         log.warning(
-            "masks are taken as they are: to check them needs %d photographs, there are %d",
+            "masks are not checked: that needs %d photographs, there are %d",
             *(PHOTOGRAPHS, count),
         )
-        return _as_they_are(masks), "too few photographs to check masks: they are as they came"
+        return _as_they_are(masks), "too few photographs to check the masks: they are unchanged"
     coverage = {name: [m.float() / 255 for m in those] for name, those in masks.items()}
     shape = object_shape.find_object(coverage["train"], depth_maps(train), box=box)
     _tell_evidence(shape, count, box)
@@ -358,17 +357,17 @@ def _judged(
     wrong = sum(bool(v.fault) and (box is None or v.fault == MISSING) for v in verdicts["train"])
     told = _told(splits, verdicts, usual)
     if 2 * wrong > count and shape.surface < SURE:
-        told += ": none is repaired, as it may be the object's shape that is wrong"
+        told += ": none is corrected, because the shape may be wrong instead"
         log.warning(
-            f"{told}. The masks keep or miss the same everywhere, or the cameras are wrong; "
-            "look at masks.html"
+            f"{told}. Either all masks make the same error or the cameras are wrong: check "
+            "masks.html"
         )
         for name, those in verdicts.items():
             kept = zip(those, masks[name], strict=True)
             verdicts[name] = [replace(verdict, mask=one) for verdict, one in kept]
         return verdicts, told
     if any(v.fault for those in verdicts.values() for v in those):
-        told += ": repaired from the other photographs; look at masks.html"
+        told += ": corrected from the other photographs; check masks.html"
     log.info(told)
     return verdicts, told
 
@@ -387,7 +386,7 @@ def _told(splits: dict[str, Photos], verdicts: dict[str, list[Verdict]], usual: 
     if not wrong:
         return told
     parts = []
-    said = {BESIDE: "keep something beside the object", MISSING: "miss a part"}
+    said = {BESIDE: "include something beside the object", MISSING: "miss a part"}
     for fault, words in said.items():
         if stems := faults[fault]:
             parts.append(f"{len(stems)} {words} ({some(stems)})")

@@ -1,5 +1,4 @@
-"""Masks of many photographs: from a network, and which of them the object that all agree on
-contradicts."""
+"""Masks of many photographs from a network, and which of them contradict the object."""
 
 from __future__ import annotations
 
@@ -55,7 +54,7 @@ NETWORKS: dict[str, Network] = {
 
 
 def check_network(name: str) -> Network:
-    """The network of a name; a UserError where there is none."""
+    """The network of a name; a UserError if there is none."""
     if name not in NETWORKS:
         raise UserError(f"network: expected one of {', '.join(NETWORKS)}, got {name}", "network")
     return NETWORKS[name]
@@ -79,11 +78,11 @@ def mask_network(name: NetworkName = NETWORK) -> Callable[[Tensor], Tensor]:
     except (ImportError, SystemExit):  # it ends Python where onnxruntime is missing
         return _by_onnxruntime(network, weights)
     if not weights.is_file():
-        log.info("%s: weights of %g MB are fetched once", name, network.megabytes)
+        log.info("%s: downloading the weights once, %g MB", name, network.megabytes)
     try:
         session = rembg.new_session(name)
     except OSError as error:  # requests' errors are some
-        raise DataError(f"{weights}: expected weights of {name}; fetching: {error}") from None
+        raise DataError(f"{weights}: expected {name}; the download failed: {error}") from None
 
     def masked(photograph: Tensor) -> Tensor:
         mask = session.predict(Image.fromarray(photograph.numpy()))[0]
@@ -99,16 +98,16 @@ def _by_onnxruntime(network: Network, weights: Path) -> Callable[[Tensor], Tenso
         onnxruntime = None
     if onnxruntime is None or not weights.is_file():
         raise MissingExtra(
-            "masks from a network need rembg: pip install 'univoxel[masks]'; or onnxruntime, and "
-            f"the network's weights as {weights}; or masks of your own: cutout --from FOLDER, "
-            "capture --masks FOLDER"
+            "making masks with a network needs rembg: pip install 'univoxel[masks]'; or install "
+            f"onnxruntime and put the network's weights at {weights}; or pass your own masks: "
+            "cutout --from FOLDER, capture --masks FOLDER"
         )
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     try:
         session = onnxruntime.InferenceSession(str(weights), options, ["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's own have no common root but this
-        raise DataError(f"{weights}: expected a network, could not read it: {error}") from None
+        raise DataError(f"{weights}: this network could not be read: {error}") from None
     return lambda photograph: _prediction(network, session, photograph)
 
 
@@ -133,7 +132,7 @@ def timed(
     masked: Callable[[Tensor], Tensor], name: NetworkName, count: int
 ) -> Callable[[Tensor], Tensor]:
     """The same function, which tells after the first photograph how long so many take."""
-    log.info("masks: from the network %s, of %g MB", name, NETWORKS[name].megabytes)
+    log.info("masks: using the network %s, %g MB", name, NETWORKS[name].megabytes)
     first = True
 
     def measured(photograph: Tensor) -> Tensor:
@@ -143,7 +142,7 @@ def timed(
         if first:
             first, seconds = False, monotonic() - begun
             whole = duration(count * seconds)
-            log.info("masks: %.1f s a photograph, about %s for %d", seconds, whole, count)
+            log.info("masks: %.1f s per photograph, about %s for %d", seconds, whole, count)
         return mask
 
     return measured
@@ -209,7 +208,7 @@ def repaired(mask: Tensor, silhouette: Tensor, voxel: float) -> Tensor:
     """The mask within the grown silhouette, and all of the shrunk one; borders one voxel soft.
 
     In the band between both the mask is believed where it ends there, full on the inner side and
-    empty on the outer one. Elsewhere, as where the table goes on, the silhouette is.
+    empty on the outer one. Elsewhere, as where the table continues, the silhouette is.
     """
     small = shrunk(mask, silhouette.shape[1], silhouette.shape[0])
     away = mask_distances(silhouette.float()[None])[0] / voxel

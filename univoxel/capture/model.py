@@ -1,4 +1,4 @@
-"""COLMAP's files: its database of features and matches, and models with their points."""
+"""COLMAP's files: the database of features and matches, and models with their points."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from univoxel.data.lens import Lens
 
 
 MOST_IMAGES = 2147483647  # what pair ids are made with
-WATERMARK = 7  # configuration of a pair whose match is a shift alone, near the pictures' border
+WATERMARK = 7  # configuration of a pair whose match is a shift only, near the pictures' border
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def positions(path: Path) -> dict[int, np.ndarray]:
 
 # Models of COLMAP with their points, read and written whole.
 #
-# `univoxel.data.colmap` reads cameras and poses alone, of any model; here are tracks as well.
+# `univoxel.data.colmap` reads cameras and poses only, of any model; here are tracks as well.
 # Source: COLMAP's documentation, "Output Format", binary.
 
 

@@ -1,5 +1,4 @@
-"""Photographs of any format, and sharp frames of a video: which there are, what they say of
-their camera, their pixels upright."""
+"""Photographs of any format and sharp frames of a video: listing, metadata, upright pixels."""
 
 from __future__ import annotations
 
@@ -66,7 +65,7 @@ class Photograph:
     camera: str = ""  # maker and model
     focal: tuple[float, float] = (0.0, 0.0)  # millimetres: as it is, and for 35 mm film; 0 unknown
     whole: bool = False  # whether the file is as the camera took it, not cropped or shrunk
-    turned: int = 1  # how the stored pixels must be turned, as of EXIF
+    turned: int = 1  # how the stored pixels must be turned, as in EXIF
 
     @property
     def name(self) -> str:
@@ -110,7 +109,7 @@ def find_photographs(folder: Path) -> tuple[list[Path], list[str], int]:
     where = ", ".join(str(p.relative_to(folder)) for p in inner[:NAMED])
     raise DataError(
         f"{folder}: expected photographs ({' '.join((*PLAIN, *HEIF))} or RAW), got none"
-        + (f" but in {where}: give that folder, or put all into one" if inner else "")
+        + (f", but some in {where}: pass that folder, or put all into one" if inner else "")
     )
 
 
@@ -132,12 +131,12 @@ def require_readers(paths: list[Path]) -> None:
         found = next((p for p in paths if p.suffix.lower() in suffixes), None)
         if found and importlib.util.find_spec(module) is None:
             raise MissingExtra(
-                f"{found.name}: {kind} needs {package}: pip install 'univoxel[capture]'"
+                f"{found.name}: reading {kind} needs {package}: pip install 'univoxel[capture]'"
             )
 
 
 def describe(path: Path) -> Photograph:
-    """Size and camera of a photograph, from its beginning alone; a DataError if it is damaged."""
+    """Size and camera of a photograph, from its beginning only; a DataError if it is damaged."""
     try:
         if path.suffix.lower() in RAW:
             return _describe_raw(path)
@@ -150,7 +149,7 @@ def describe(path: Path) -> Photograph:
             camera = " ".join(str(exif.get(tag, "")).strip("\0 ") for tag in (MAKE, MODEL))
             focal = _number(details.get(FOCAL)), _number(details.get(FOCAL_35MM))
     except BROKEN as error:
-        raise DataError(f"{path}: expected a photograph, could not read it: {error}") from None
+        raise DataError(f"{path}: this photograph could not be read: {error}") from None
     whole = stated == sorted((width, height))
     if turned in SIDEWAYS:
         width, height = height, width
@@ -177,7 +176,7 @@ def read_upright(path: Path, longest: int = 0) -> Image.Image:
             picture = srgb_of(shrunk_to(_eight_bits(image), longest), image)
             orientation = image.getexif().get(ORIENTATION, 1)
     except BROKEN as error:
-        raise DataError(f"{path}: expected a photograph, could not read it: {error}") from None
+        raise DataError(f"{path}: this photograph could not be read: {error}") from None
     picture.info.pop("icc_profile", None)
     picture.getexif()[ORIENTATION] = orientation
     return ImageOps.exif_transpose(picture)
@@ -276,7 +275,7 @@ PRIMARIES = {
     "smpte240m": (0.630, 0.340, 0.310, 0.595, 0.155, 0.070, 0.3127, 0.3290),
     "bt470bg": (0.640, 0.330, 0.290, 0.600, 0.150, 0.060, 0.3127, 0.3290),
 }
-# Of a video that states primaries alone
+# Of a video that states primaries only
 MATRIX_OF = {"bt709": "bt709", "bt2020": "bt2020", "smpte432": "bt709"}
 MATRIX_OF |= dict.fromkeys(("smpte170m", "bt470bg"), "bt601")
 OTHER_MATRICES = ("bt2020c", "ictcp", "ipt-c2", "ycgco", "smpte2085")  # that ffmpeg does not undo
@@ -293,7 +292,7 @@ def is_video(path: Path) -> bool:
 def require_ffmpeg() -> None:
     """Raise a MissingExtra, before anything is read, where videos cannot be."""
     if importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise MissingExtra("a video needs imageio-ffmpeg: pip install 'univoxel[capture]'")
+        raise MissingExtra("reading a video needs imageio-ffmpeg: pip install 'univoxel[capture]'")
 
 
 def write_frames(video: Path, folder: Path, every: float | None = None) -> int:
@@ -319,7 +318,7 @@ def write_frames(video: Path, folder: Path, every: float | None = None) -> int:
         change = np.abs(pictures[frame].astype(np.int16) - pictures[kept[-1]])
         kept += [frame] if change.mean() > STILL else []
     if not kept:
-        raise DataError(f"{video}: expected a video, got none of its frames")
+        raise DataError(f"{video}: no frame of this video could be read")
     folder.mkdir(parents=True, exist_ok=True)
     which = "+".join(f"eq(n\\,{n})" for n in kept)
     target = str(folder.absolute() / "frame").replace("%", "%%") + "_%05d.jpg"
@@ -346,7 +345,7 @@ def _to_jpeg(video: Path, folder: Path) -> str:
     tags = next((w for w in words if w not in ("tv", "pc") and w not in FIELDS), "unknown")
     matrix, primaries, curve = tags.split("/") if tags.count("/") == 2 else [tags] * 3
     if matrix in OTHER_MATRICES:
-        log.warning("%s: colours of %s may come out wrong: record in BT.709", video.name, matrix)
+        log.warning("%s: %s colours may come out wrong: record in BT.709", video.name, matrix)
     if primaries == "unknown" and (curve in HDR or matrix.startswith("bt2020")):
         primaries = "bt2020"
     if matrix == "unknown":
@@ -360,7 +359,7 @@ def _to_jpeg(video: Path, folder: Path) -> str:
         _write_table(folder / TABLE, stated, curve)
         table = f",lut3d=file={TABLE}:interp=tetrahedral"
     if curve in HDR:
-        said = "%s: colours of %s (HDR) were tone mapped: what is brighter than white paper is flat"
+        said = "%s: %s colours (HDR) were tone mapped: all above white paper is clipped"
         log.warning(said, video.name, HDR[curve])
     exact = "flags=bicubic+accurate_rnd+full_chroma_int"
     return (
@@ -430,7 +429,7 @@ def seconds(video: Path) -> float:
     if not found:  # of recordings that were written as they came: the time of the last frame
         found = re.findall(f"time={clock}", _about(video, "-c", "copy", "-f", "null", "-"))
     if not found:
-        raise DataError(f"{video}: expected a video, could not read it")
+        raise DataError(f"{video}: this video could not be read")
     hours, minutes, rest = found[-1]
     return 3600 * int(hours) + 60 * int(minutes) + float(rest)
 
@@ -448,12 +447,12 @@ def _ffmpeg(video: Path, filters: str, *output: str, place: str | None = None) -
     done = subprocess.run(command, capture_output=True, check=False, cwd=place)
     if done.returncode:
         said = done.stderr.decode("utf-8", "replace").strip().splitlines() or ["no reason given"]
-        raise DataError(f"{video}: expected a video, could not read it: {said[-1]}")
+        raise DataError(f"{video}: this video could not be read: {said[-1]}")
     return done.stdout
 
 
 def _opened(video: Path) -> list[str]:
-    """Arguments that open a video alone: no file that it names, nothing over a network."""
+    """Arguments that open a video only: no file that it names, nothing over a network."""
     allowed = ["-protocol_whitelist", "file", "-format_whitelist", VIDEO_FORMATS]
     return [*allowed, "-i", f"file:{video.absolute()}"]
 

@@ -1,4 +1,4 @@
-"""Whether the poses that structure from motion found can be right, and why others are missing.
+"""Checks of the poses from structure from motion, and the reasons why others are missing.
 
 Structure from motion keeps the matches that fit and drops the others. Those dropped tell where it
 went wrong: of a photograph placed right, nearly all matches fit its place, however few there are.
@@ -61,7 +61,7 @@ def partners(
         a, b = looks[pair.first], looks[pair.second]
         for one, other, columns in ((a, b, [0, 1]), (b, a, [1, 0])):
             matches = pair.matches[:, columns]
-            # A shift alone is what stands still in the pictures, whatever the cameras do
+            # A shift only is what stands still in the pictures, whatever the cameras do
             off = _off(model, one, other, matches)
             fitting = 0 if pair.kind == WATERMARK else int((off < FITTING_PIXELS).sum())
             found[one.image.number].append(Partner(other.image.number, len(matches), fitting))
@@ -141,7 +141,7 @@ def doubt(model: Model, image: Placed, error: float) -> float:
 
 
 def still(pairs: Sequence[tuple[int, int, int, int]]) -> tuple[int, int]:
-    """Pairs whose match is a shift alone, and pairs that match at all.
+    """Pairs whose match is a shift only, and pairs that match at all.
 
     Args:
         pairs: as `model.verified_pairs` has them.
@@ -168,12 +168,12 @@ def weak(
     if not points:
         return {}
     least = max(WEAK_POINTS, WEAK_SHARE * float(np.median(list(points.values()))))
-    few = {n: f"hangs on {count} points" for n, count in points.items() if count < least}
+    few = {n: f"only {count} points" for n, count in points.items() if count < least}
     against = {}
     for number, those in partners.items():
         share, matches = _fitting(those)
         if matches >= WEAK_POINTS and share < CONTRADICTED_SHARE:
-            against[number] = f"{1 - share:.0%} of its matches contradict its place"
+            against[number] = f"{1 - share:.0%} of its matches contradict its pose"
     open_ones = {n for n in few if doubts[n] <= WEAK_DOUBT} - against.keys()
     while True:
         doubtful = few.keys() | against.keys()
@@ -210,10 +210,10 @@ def why_not(
         elsewhere: of pictures that other models hold, the size of theirs.
     """
     if number is None or not features.get(number):
-        return "nothing in it to hold on to"
+        return "no features in it that can be matched"
     if number in elsewhere:
-        return f"with {elsewhere[number]} others that nothing connects to the rest"
+        return f"connected to {elsewhere[number]} others, but not to the rest"
     best = max((n for a, b, n, _ in pairs if number in (a, b)), default=0)
     if best < NEEDED:
-        return f"{best} matches with its best partner; {NEEDED} needed"
-    return f"{best} matches with its best partner, which do not fit the others"
+        return f"{best} matches with its best partner; {NEEDED} are needed"
+    return f"{best} matches with its best partner, which disagree with the others"

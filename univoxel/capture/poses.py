@@ -1,4 +1,4 @@
-"""Find the cameras of photographs: from a folder of them, or a video, to a scene to train on."""
+"""Camera poses for a folder of photographs or a video, written as a scene to train on."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from univoxel.errors import DataError, ExistingFile, StillBackground
 from univoxel.sphere import gaps
 
 WORK = "sfm"  # folder in the scene that the steps keep their results in
-# Steps that are noted in it: those of the search, with its settings, and what stands by itself
+# Steps that are noted in it: those of the search, with its settings, and what is by itself
 SEARCH, FRAMES, SCENE = "search", "frames", "scene"
 PARTS = FEATURES, PAIRS, MATCHES, MODELS = "features", "choosing pairs", "matching", "placing"
-# Share of pairs whose match is a shift alone, from where on the background stands still while the
+# Share of pairs whose match is a shift only, from where on the background stands still while the
 # object turns: on a turntable it was .6, elsewhere 0, with poor masks .04
 STILL_SHARE = 0.2
 PLACED_SHARE = 0.8  # of the photographs, below which the capture is no use
@@ -67,27 +67,26 @@ def poses(
     keep_weak: bool = False,
     config: CaptureConfig = DEFAULTS,
 ) -> Path:
-    """Write photographs upright, with the cameras they were taken with, as a scene; return out.
+    """Find the camera poses of photographs and write both as a scene; return out.
 
-    The world has +Z up, its origin where the cameras look, and the median distance of cameras from
-    it is 4. An interrupted search goes on with the same call.
+    Photographs are written upright. The world has +Z up, its origin is where the cameras look, and
+    their median distance from it is 4. After an interruption, call the function again to resume.
 
     Args:
-        photographs: a folder of photographs of any common format, or a video.
-        out: folder to write: images/, masks/, sparse/0 and poses.json, and sfm/ for the steps.
-        masks: folder of a mask for each photograph; features are sought within them alone.
-        every: seconds of a video, of each of which the sharpest frame is taken.
-        keep_size: pixels of written photographs along the longer side, at most; 0 for any.
-        keep_weak: write photographs too whose cameras are not trusted.
+        photographs: a folder of photographs in any common format, or a video.
+        out: folder to write images/, masks/, sparse/0 and poses.json to, and sfm/ for the steps.
+        masks: folder with a mask for each photograph; features are detected inside them only.
+        every: seconds; the sharpest frame of a video in each such period is taken.
+        keep_size: maximum longer side of the written photographs, pixels; 0: any.
+        keep_weak: also write photographs with unreliable poses.
         config: how cameras are found.
 
     Raises:
-        MissingExtra: no pycolmap, or no reader of a format.
-        DataError: photographs that cannot be used, or too few that can be placed; as
-            StillBackground where an object was turned before a still camera, and there are no
-            masks.
+        MissingExtra: pycolmap or the reader of a format is missing.
+        DataError: photographs cannot be used, or too few can be registered. StillBackground: the
+            object was turned before a static camera, and there are no masks.
         ExistingFile: out holds something else.
-        ProcessFailed: a step did not end well.
+        ProcessFailed: a step failed.
         OSError: a file cannot be written.
     """
     source, out = Path(photographs), Path(out)
@@ -103,7 +102,7 @@ def poses(
     settings = _settings(source, masks, every, config, capture)
     used = {"keep_size": keep_size, "keep_weak": keep_weak}
     if _begin(out, folders, settings, used):
-        log.info(f"{out} is done")
+        log.info(f"{out} is complete")
         return out
     with bar(
         TextColumn("{task.description}"),
@@ -122,7 +121,7 @@ def poses(
         model = scene.own_sizes(Model(model.cameras, ordered, model.points), capture, keep_size)
         model, known = scene.gauge_aligned(model)
         if not known:
-            log.warning("the cameras do not say what is up: the world may be askew")
+            log.warning("the world may be tilted: the cameras do not show what is up")
         names = [image.name for image in model.images]
         centres = np.stack([image.centre for image in model.images])
         for gap in gaps(centres, names, GAP):
@@ -177,7 +176,7 @@ def photographs_of(
         photographs.require_ffmpeg()
         stamp = [source.name, source.stat().st_size, source.stat().st_mtime, every]
         if steps.recorded(folders.work, FRAMES) != stamp:
-            log.info(f"{source}: choosing frames")
+            log.info(f"{source}: selecting frames")
             steps.forget(folders.work, FRAMES)
             shutil.rmtree(folders.frames, ignore_errors=True)
             photographs.write_frames(source, folders.frames, every)
@@ -185,7 +184,7 @@ def photographs_of(
         return sorted(folders.frames.glob("*.jpg")), [], 0
     if every is not None:
         raise DataError(
-            f"{source}: every is for videos ({' '.join(photographs.SUFFIXES)})", "every"
+            f"{source}: every applies to videos only ({' '.join(photographs.SUFFIXES)})", "every"
         )
     if not source.is_dir():
         raise DataError(f"{source}: expected a folder of photographs or a video")
@@ -195,7 +194,7 @@ def photographs_of(
 def _settings(
     source: Path, masks: Path | None, every: float | None, config: CaptureConfig, capture: Capture
 ) -> dict:
-    """What decides the cameras: the same settings go on with the same work."""
+    """What decides the cameras: the same settings continue with the same work."""
     files = [p.path for p in capture.photographs] + list(capture.masks or [])
     return {
         "engine": "pycolmap",
@@ -208,7 +207,7 @@ def _settings(
 
 
 def _begin(out: Path, folders: Folders, settings: dict, written: dict) -> bool:
-    """Begin a search, or go on with it; whether all is done already."""
+    """Begin a search, or continue with it; whether all is done already."""
     if (out / scene.REPORT).exists():
         other = ExistingFile(f"{out} holds another scene: choose another out", "out")
         if not steps.done(folders.work, SEARCH, settings, lambda _: other):
@@ -254,10 +253,10 @@ def _search(
     do(MATCHES, structure.match, structure.pair_count(folders))
     still, matching = pose_validation.still(database.verified_pairs(folders.database))
     if still > STILL_SHARE * matching:
-        stands = f"the background stands still in {still} of {matching} pairs"
+        stands = f"the background is static in {still} of {matching} pairs"
         if capture.masks is None:
             raise StillBackground(stands)
-        raise DataError(f"{stands}: masks hold a part of it, make them tighter", "masks")
+        raise DataError(f"{stands}: the masks include part of it, so make them tighter", "masks")
     do(MODELS, structure.place, total)
     return unreadable
 
@@ -299,8 +298,8 @@ def _judge(capture: Capture, folders: Folders, unreadable: dict[int, str]) -> Fo
     if len(placed) < PLACED_SHARE * len(reports):
         missing = [f"{r.name} ({r.reason})" for r in reports if not r.placed]
         raise DataError(
-            f"only {len(placed)} of {len(reports)} photographs could be placed: take more of them, "
-            f"closer to one another, all of the same still object; not placed: {_some(missing)}"
+            f"only {len(placed)} of {len(reports)} photographs were registered. Take more, "
+            f"closer together, and do not move the object. Not registered: {_some(missing)}"
         )
     return Found(models[0], weak, reports)
 
@@ -321,12 +320,12 @@ def _say(capture: Capture, found: Found, total: int, keep_weak: bool) -> None:
     shares = [f"{lens.focal[0] / lens.width:.2f}" for lens in lenses[:NAMED]]
     cameras = "one camera" if len(lenses) == 1 else f"{len(lenses)} cameras"
     log.info(
-        f"cameras: {len(model.images)} of {total} placed, {model.error:.2f} pixels, focal length "
-        f"{', '.join(shares)} of the longer side ({cameras})"
+        f"cameras: {len(model.images)} of {total} registered, mean reprojection error "
+        f"{model.error:.2f}, focal length {', '.join(shares)} of the longer side ({cameras})"
     )
     missing = [f"{r.name} ({r.reason})" for r in reports if not r.placed]
     if missing:
-        log.warning(f"not placed: {_some(missing)}")
+        log.warning(f"not registered: {_some(missing)}")
     index = {name: i for i, name in enumerate(capture.pictures)}
     weak = [
         f"{capture.photographs[index[i.name]].path.name} ({found.weak[i.number]})"
@@ -336,14 +335,14 @@ def _say(capture: Capture, found: Found, total: int, keep_weak: bool) -> None:
     if weak:
         fate = "kept" if keep_weak else "left out (keep_weak keeps them)"
         log.warning(
-            f"{len(weak)} may be off by degrees, {fate}: {_some(weak)}; "
-            "photograph that side again with more overlap",
+            f"{len(weak)} may be off by degrees, {fate}: {_some(weak)}; photograph that side "
+            "again with more overlap",
             extra={"arguments": ("keep_weak",)},
         )
 
 
 def _aside(unread: list[str], doubles: int) -> str:
-    told = f"; {doubles} came in two formats, one is taken" if doubles else ""
+    told = f"; {doubles} exist in two formats, one is used" if doubles else ""
     return told + (f"; {len(unread)} could not be read: {_some(unread)}" if unread else "")
 
 

@@ -1,4 +1,4 @@
-"""From files of any kind to the pictures, and masks, that structure from motion reads."""
+"""Prepares images and masks for structure from motion from files of any kind."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def gather(files: Sequence[Path], masks: Path | None) -> tuple[Capture, list[str
             unread.append(path.name)
     if len(photographs) < 2:
         raise DataError(
-            f"{files[0].parent}: expected two photographs at least, could read {len(photographs)}"
+            f"{files[0].parent}: expected at least two photographs, could read {len(photographs)}"
         )
     named = [(photograph.name, photograph.path) for photograph in photographs]
     found = None if masks is None else masks_in(masks, named)
@@ -90,7 +90,7 @@ def in_words(photographs: Sequence[Photograph], groups: Sequence[Sequence[int]])
     long, short = max(first.width, first.height), min(first.width, first.height)
     told = f"{len(photographs)} photographs"
     if len(groups) == 1:
-        told += f" of {first.camera} ({long}x{short})" if first.camera else f" of {long}x{short}"
+        told += f" from {first.camera} ({long}x{short})" if first.camera else f" ({long}x{short})"
     else:
         zooms = {photographs[g[0]].focal for g in groups}
         sizes = {tuple(sorted((p.width, p.height))) for p in photographs}
@@ -100,7 +100,7 @@ def in_words(photographs: Sequence[Photograph], groups: Sequence[Sequence[int]])
             for found, what in ((cameras, "models"), (zooms, "zoom settings"), (sizes, "sizes"))
             if len(found) > 1
         ]
-        told += f" of {len(groups)} cameras ({', '.join(of)})"
+        told += f" from {len(groups)} cameras ({', '.join(of)})"
     if 0 < portrait < len(photographs):
         told += f", {portrait} of them portrait"
     return told

@@ -1,4 +1,4 @@
-"""The folder of a capture: what it is made of, and where its parts lie."""
+"""The folder of a capture: its sources and its parts."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Given:
 
     path: Path
     kind: Kind  # a folder or a video; photographs with cameras; a trained run
-    files: list[tuple[str, int]]  # names and bytes of photographs; else the folder alone
+    files: list[tuple[str, int]]  # names and bytes of photographs; else the folder only
 
     @property
     def words(self) -> str:
@@ -62,13 +62,13 @@ def look_at(path: Path) -> Given:
     elif path.is_dir():
         files, _, _ = find_photographs(path)
     else:
-        came = "a file of another kind" if path.exists() else "nothing there"
+        came = "another kind of file" if path.exists() else "nothing there"
         raise DataError(f"{path}: expected a folder of photographs or a video, got {came}")
     return Given(path, "photographs", [(file.name, file.stat().st_size) for file in files])
 
 
 def begin(project: Project, given: Given) -> None:
-    """Make the folder of a capture, or go on with it.
+    """Make the folder of a capture, or continue with it.
 
     Raises:
         ExistingFile: it holds the capture of something else, or other files.
@@ -112,10 +112,10 @@ def _difference(before: Sequence[tuple[str, int]], now: Sequence[tuple[str, int]
         if name not in old:
             return f"{name} was not part of it"
         if name not in new:
-            return f"{name} is not there now"
+            return f"{name} is missing now"
         if old[name] != new[name]:
-            return f"{name} is another file now"
-    return "they came in another order"
+            return f"{name} has changed since"
+    return "their order has changed"
 
 
 def _words(files: Sequence[tuple[str, int]]) -> str:

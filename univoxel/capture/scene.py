@@ -1,4 +1,4 @@
-"""From the model of structure from motion to a scene that training reads."""
+"""Writes the model of structure from motion as a scene to train on."""
 
 from __future__ import annotations
 

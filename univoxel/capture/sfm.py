@@ -1,4 +1,4 @@
-"""Steps of structure from motion with pycolmap, each in a process of its own.
+"""Steps of structure from motion with pycolmap, each in its own process.
 
     python -m univoxel.capture.sfm REQUEST.json
 
@@ -41,7 +41,7 @@ class Request:
     masks: str = ""  # folder of NAME.png, or empty
     names: tuple[str, ...] = ()  # pictures of one camera, for extraction
     parameters: str = ""  # camera parameters to begin with, or empty
-    existing_camera: int | None = None  # of the database, where extraction goes on
+    existing_camera: int | None = None  # of the database, where extraction continues
     features: int = 4096
     first_octave: int = -1
     seed: int = 0
@@ -77,12 +77,12 @@ def run(request: Request, log: Path, done: Callable[[], int] | None = None) -> I
             yield count()
             if time.monotonic() - begin > limit:
                 raise ProcessFailed(
-                    f"{request.step}: pycolmap was stopped after {request.seconds:.0f} seconds"
+                    f"{request.step}: pycolmap was stopped after {request.seconds:.0f} s"
                 )
     if process.returncode:
-        said = guard.last_words(log.read_bytes()) or "it said nothing"
+        said = guard.last_words(log.read_bytes()) or "no message"
         raise ProcessFailed(
-            f"{request.step}: pycolmap ended with {process.returncode}: {said} (see {log})"
+            f"{request.step}: pycolmap failed ({process.returncode}): {said} (see {log})"
         )
     yield count()
 

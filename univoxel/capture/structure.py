@@ -1,4 +1,4 @@
-"""Features, pairs, matches and models of a capture. Features go on where they stopped."""
+"""Features, pairs, matches and models of a capture. An interrupted extraction is resumed."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The command line: parse, run one command, turn a user's mistake into one line.
+"""The command line: parse arguments, run one command, print a mistake of the user in one line.
 
-A command is one file: its options, a record, and what it does. Files import torch, and what needs
-it, inside of functions: `univoxel --help` does not wait for it.
+Each command is a file with a record of its options and a function. The files import torch inside
+functions only, so that `univoxel --help` does not wait for it.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ MISTAKES = (UserError, OSError, MemoryError)
 # Of files and disks of the user, whether or not the error names the file
 DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
 PACKAGE = Path(__file__).resolve().parents[1]
-CLONE = PACKAGE.parent  # of the repository, where the package stands in one
+CLONE = PACKAGE.parent  # of the repository, where the package is in one
 # Options whose names differ from the arguments of the package's functions
 OPTIONS = {"changes": "--set", "source": "--from"}
 
@@ -60,12 +60,12 @@ SPINS = "3000"
 def completion(
     shell: Annotated[Shell, parsing.written("bash|zsh|fish", positional=True)], /
 ) -> None:
-    """Print what makes a shell complete commands, options and choices.
+    """Print a shell completion script.
 
-    For bash, in ~/.bashrc: eval "$(univoxel completion bash)"
+    For bash, add this line to ~/.bashrc: eval "$(univoxel completion bash)"
 
     Args:
-        shell: that reads it
+        shell: your shell
     """
     lab = laboratory() if has_laboratory() else {}
     print(parsing.completion(shell, COMMANDS, lab), end="")
@@ -96,16 +96,16 @@ LABORATORY = ("compare", "chart", "stress", "bank", "submit")
 
 
 def has_laboratory() -> bool:
-    """Whether the package stands in a clone, beside the folder `lab`, which no wheel holds."""
+    """Whether the package is in a clone, beside the folder `lab`, which no wheel holds."""
     return (CLONE / "lab" / "commands.py").is_file()
 
 
 def laboratory() -> dict[str, Command]:
-    """Commands of the laboratory by name; a MissingExtra where there is none beside the package."""
+    """Commands of the experiments by name; a MissingExtra if there is none beside the package."""
     if not has_laboratory():
         raise MissingExtra(
-            f"{', '.join(LABORATORY)} measure the method and are not part of the installed "
-            "package: clone the repository, run `make dev` there, and call .venv/bin/univoxel lab"
+            f"{', '.join(LABORATORY)} are experiments, which the installed package lacks: clone "
+            "the repository, run `make dev` there, and use .venv/bin/univoxel lab"
         )
     return importlib.import_module("lab.commands").COMMANDS
 
@@ -113,8 +113,8 @@ def laboratory() -> dict[str, Command]:
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns the exit code.
 
-    0; 1 where nobody reads the output to its end; 2 for a user's mistake; 3 where a stage of a
-    training made no step; 130 when interrupted.
+    0: success; 1: the reader of the output closed it; 2: a mistake of the user; 3: a stage of a
+    training made no step; 130: interrupted.
 
     The hidden flag --traceback shows where an error came from.
     """
@@ -187,7 +187,7 @@ def understood(arguments: Sequence[str]) -> Call | None:
 
     Raises:
         Usage: they make no command.
-        MissingExtra: one of the laboratory, which is not there.
+        MissingExtra: one of the experiments, which is not there.
     """
     match arguments:
         case [name, *_] if name in LABORATORY:
@@ -204,36 +204,34 @@ def help_screen(arguments: Sequence[str]) -> str | None:
         case [] | ["-h" | "--help" | "help"]:
             title = f"univoxel {__version__}: from photographs to a relightable object, on any CPU"
             return parsing.overview(
-                title, groups(), "univoxel COMMAND --help says what a command takes."
+                title, groups(), "For the options of a command, run univoxel COMMAND --help."
             )
         case ["lab"] | ["lab", "-h" | "--help" | "help"]:
-            end = f"univoxel {LAB} COMMAND --help says what a command takes."
-            return parsing.overview(
-                "Commands of the laboratory", {f"univoxel {LAB}": laboratory()}, end
-            )
+            end = f"For the options of a command, run univoxel {LAB} COMMAND --help."
+            return parsing.overview("Experiments", {f"univoxel {LAB}": laboratory()}, end)
     return None
 
 
 def groups() -> dict[str, dict[str, Command]]:
-    """Commands in the order of work; what no group names is of a run."""
+    """Commands in the order of work; those in no group are commands on a run."""
     first = ("capture", "poses", "cutout", "train", "batch")
     last = ("demo", "doctor", "completion")
     run = [name for name in COMMANDS if name not in first + last]
-    named = {"From photographs": first, "Of a run": run, "Of the package": last}
+    named = {"Make a run": first, "Use a run": run, "Other commands": last}
     found = {g: {n: COMMANDS[n] for n in names} for g, names in named.items()}
-    found["Of the package"][LAB] = lab
+    found["Other commands"][LAB] = lab
     return found
 
 
 def lab() -> None:
-    """From a clone of the repository: what measures the method."""
+    """Run experiments, in a clone of the repository."""
 
 
 def take_threads(threads: int | None) -> None:
-    """Let kernels, torch and processes begun from here run on so many threads.
+    """Set the number of threads of kernels, torch and child processes.
 
-    None: as many as OMP_NUM_THREADS says, or else as there are cores. Where a control group grants
-    less of those, as of a container, OpenMP does not see it: a thread for each would wait.
+    None: OMP_NUM_THREADS, or else one per core. If a control group grants fewer cores, as in a
+    container, OpenMP does not see it, and the surplus threads would wait.
     """
     if threads is None:
         granted = machine.cores()
@@ -330,11 +328,11 @@ def _kept(call: Call) -> str:
     """What an interrupted command left behind."""
     out = call.run.keywords.get("out")
     if call.name in ("batch", "lab compare", "lab chart", "lab stress"):
-        return f"; {out} keeps the trainings that are done: the same command goes on"
+        return f"; finished trainings are in {out}: run the same command again to resume"
     if call.name in ("capture", "poses"):
-        return f"; {out} keeps the steps that are done: the same command goes on"
+        return f"; finished steps are in {out}: run the same command again to resume"
     if call.name != "train" or not isinstance(out, Path):
         return ""
     if (out / "scene.safetensors").exists():
-        return f"; {out} keeps the last saved state: go on with --resume"
+        return f"; the last saved state is in {out}: continue with --resume"
     return f"; nothing was saved in {out} yet"

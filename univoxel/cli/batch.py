@@ -1,4 +1,4 @@
-"""Many scenes, each through the same steps, on one machine or on a cluster; what came out."""
+"""Process many scenes on one machine or a cluster."""
 
 from __future__ import annotations
 
@@ -28,40 +28,38 @@ EACH = ("steps", "masks", "preset", "light", "minutes", "config", "changes", "sa
 @dataclass(frozen=True, kw_only=True)
 class BatchOptions:
     scenes: parsing.Scenes
-    """folders of photographs, of different names"""
+    """folders of photographs with different names"""
     out: Annotated[Path, parsing.written("NIGHT")]
-    """folder to write"""
+    """folder to write to"""
     steps: Annotated[tuple[choices.BatchStep, ...], parsing.written("STEP [STEP ...]")] = (
         choices.USUAL_STEPS
     )
-    """of each scene: train eval export page; before them poses masks, for photographs without
-    cameras or masks, as capture makes them"""
+    """steps per scene, in this order: poses masks train eval export page"""
     masks: Annotated[str, parsing.written("auto|rembg|FOLDER|none")] = "auto"
-    """as of capture, for the step masks"""
+    """source of the masks for the step masks, as in capture"""
     preset: choices.PresetOrAuto = "auto"
-    """as of train"""
-    light: choices.LightName = "hybrid"
-    """as of train"""
+    """amount of work, from draft to best; auto: what fits --minutes, else fast"""
+    light: Annotated[choices.LightName, parsing.ADVANCED] = "hybrid"
+    """lighting model; hybrid separates shadows best, the others are for comparison"""
     minutes: parsing.Minutes = None
-    """wall-clock limit of each training, above 0"""
+    """time limit of each training"""
     config: parsing.ConfigFile = None
-    """as of train"""
+    """reuse the config.json of another run in place of --preset and --light"""
     changes: parsing.Changes = ()
-    """as of train"""
-    samples: int = choices.SAMPLES
-    """of the light, per pixel of relit pictures that are measured"""
+    """change one configuration field, such as loss.radiance=0.5; repeatable"""
+    samples: Annotated[int, parsing.ADVANCED] = choices.SAMPLES
+    """light samples per pixel of relit test images"""
     jobs: Annotated[int | None, parsing.written("N", "as cores and memory allow")] = None
-    """scenes at once; each runs on --threads, or its share of the cores"""
+    """scenes at once; each gets --threads threads, or its share of the cores"""
     scheduler: parsing.Scheduler = None
-    """of a Dask cluster whose workers take the scenes, such as tcp://10.0.0.1:8786; they see the
-    same folders. Whoever reaches a scheduler can run programs on its workers"""
-    tries: Annotated[int, parsing.written("N")] = 3
-    """how often a scene whose process is killed is tried before it counts as failed"""
+    """Dask scheduler to use; anyone who can reach it can run code on its workers"""
+    tries: Annotated[int, parsing.ADVANCED] = 3
+    """attempts per scene, if its process is killed"""
     json: parsing.JsonFile = None
-    """another file for what batch.json holds; - prints it in place of the table"""
+    """also write the contents of batch.json here; - prints them, not the table"""
 
     def training(self) -> TrainConfig:
-        """The configuration of a training; a UserError where there is none of that kind."""
+        """The configuration of a training; a UserError if there is none of that kind."""
         from univoxel.config import load_config
         from univoxel.core.validation import changed
         from univoxel.presets import chosen
@@ -71,14 +69,14 @@ class BatchOptions:
             return changed(config, self.changes)
         if (self.preset, self.light) != ("auto", "hybrid"):
             raise UserError(
-                f"expected config or preset and light, got both: {self.config} says them", "config"
+                f"expected config or preset and light, got both: {self.config} sets them", "config"
             )
         config = load_config(self.config)
         minutes = config.minutes if self.minutes is None else self.minutes
         return changed(replace(config, minutes=minutes), self.changes)
 
     def identity(self, data: Path) -> dict[str, Any]:
-        """What a later sitting must agree with to go on; JSON. Steps may be added."""
+        """What a later sitting must agree with to continue; JSON. Steps may be added."""
         said = {name: getattr(self, name) for name in EACH[1:]} | {"data": str(data)}
         if self.config is not None:
             said["config"] = read_json(self.config)
@@ -95,13 +93,12 @@ class BatchOptions:
 
 @parsing.takes(BatchOptions)
 def command(asked: BatchOptions) -> None:
-    """Take many scenes through training, measures, mesh and page, on one machine or a cluster.
+    """Process many scenes, on one machine or a cluster.
 
-    Each scene has processes of its own: one that crashes, or that the system ends, takes no other
-    with it. What is done is kept: the same command goes on after an interruption, and tries again
-    what failed. NIGHT/index.html shows all scenes, batch.json and batch.csv hold their measures,
-    NIGHT/SCENE has what was made, NIGHT/logs what was said. Ends with exit code 2 where a scene
-    failed.
+    Each step of a scene runs in its own process, so a crash does not affect the other scenes.
+    Finished steps are kept: run the same command again to resume, or to retry failed scenes.
+    NIGHT/index.html shows all scenes, batch.json and batch.csv hold their metrics, NIGHT/SCENE the
+    results and NIGHT/logs the logs. If a scene fails, the exit code is 2.
     """
     import rich
 
@@ -115,17 +112,17 @@ def command(asked: BatchOptions) -> None:
 
 
 def batch(asked: BatchOptions, threads: int | None = None) -> list[SceneResult]:
-    """Take scenes through steps, each in processes of its own; return what came out, in order.
+    """Process scenes, each step in its own process; return the results in order.
 
-    index.html, batch.json and batch.csv tell of all of them, and are written anew as each ends.
+    index.html, batch.json and batch.csv list all scenes and are updated when one ends.
 
     Args:
-        threads: of each scene; None: as the machine allows.
+        threads: threads per scene; None: as the machine allows.
 
     Raises:
-        UserError: an argument cannot be used, Dask is missing, or out holds scenes that other
-            options made; nothing was begun.
-        ProcessFailed: the scheduler does not answer, or is gone.
+        UserError: an argument cannot be used, Dask is missing, or out holds scenes that were
+            processed with other options; nothing was started.
+        ProcessFailed: the scheduler does not answer, or the connection was lost.
         OSError: out cannot be written.
     """
     from univoxel.batch.jobs import connect, run_jobs
@@ -134,7 +131,7 @@ def batch(asked: BatchOptions, threads: int | None = None) -> list[SceneResult]:
     unknown = [step for step in asked.steps if step not in choices.BATCH_STEPS]
     if unknown or not asked.steps:
         got = ", ".join(unknown) or "none"
-        raise UserError(f"steps must be of {', '.join(choices.BATCH_STEPS)}, got {got}", "steps")
+        raise UserError(f"steps must be among {', '.join(choices.BATCH_STEPS)}, got {got}", "steps")
     numbers = {"jobs": asked.jobs, "threads": threads}
     numbers |= {"tries": asked.tries, "samples": asked.samples}
     for name, number in numbers.items():
@@ -145,7 +142,7 @@ def batch(asked: BatchOptions, threads: int | None = None) -> list[SceneResult]:
     if asked.scheduler is None:
         here = (machine.cores(), machine.memory())
         jobs, threads = share(known.values(), config, *here, jobs, threads)
-        log.info("scenes at once: %d, threads of each: %d", jobs, threads)
+        log.info("%d scenes at once, %d threads each", jobs, threads)
     elif jobs is not None:
         raise UserError("expected jobs or scheduler, got both", "jobs", "scheduler")
     every = [job_of(name, data, asked, threads) for name, data in known.items()]
@@ -222,8 +219,8 @@ def check(results: Sequence[SceneResult]) -> None:
     failed = [result.name for result in results if result.state != "done"]
     if failed:
         raise ProcessFailed(
-            f"{len(failed)} of {len(results)} scenes failed ({', '.join(failed)}): "
-            "the same command tries them again"
+            f"{len(failed)} of {len(results)} scenes failed ({', '.join(failed)}): run the same "
+            "command again to retry them"
         )
 
 
@@ -232,7 +229,7 @@ def table(results: Sequence[SceneResult]) -> Table:
     from rich.table import Table
 
     rows = Table("scene", "state", "verdict")
-    for head in ("novel views, dB", "doubt of albedo", "seconds"):
+    for head in ("novel views, dB", "albedo uncertainty", "seconds"):
         rows.add_column(head, justify="right")
     rows.add_column("error")
     for r in results:

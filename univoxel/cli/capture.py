@@ -1,4 +1,4 @@
-"""From photographs to an object that can be lit anew, in one go: cameras, masks, training, mesh."""
+"""From photographs to a relightable object in one command: cameras, masks, training, mesh."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from univoxel.capture.config import DEFAULTS, CaptureConfig
 from univoxel.cli.demo import MAPS, SCENE
 from univoxel.cli.evaluate import evaluate
 from univoxel.cli.export import export
-from univoxel.cli.parsing import BoxOf, Changes, Minutes, check_minutes, takes, written
+from univoxel.cli.parsing import ADVANCED, BoxOf, Changes, Minutes, check_minutes, takes, written
 from univoxel.cli.relight import relight_to_files
 from univoxel.cli.train import code_of
 from univoxel.core import choices, files, log
@@ -33,37 +33,34 @@ if TYPE_CHECKING:
     from univoxel.training.progress import TrainingProgress
 
 
-AUTO = "auto"  # masks that the photographs have, or else of a network, or of depth alone
+AUTO = "auto"  # masks that the photographs have, or else of a network, or of depth only
 STEPS = ("cameras", "masks", "training", "mesh", "pictures", "page")
 
 
 @dataclass(frozen=True)
 class CaptureOptions:
     photographs: Annotated[Path, written("PHOTOS", positional=True)]
-    """what to begin with: a folder of photographs or a video; photographs with cameras, as train
-    reads them; or the folder of a trained run"""
+    """folder of photographs, video, posed data set, or folder of a trained run"""
     out: Annotated[Path, written("DIR")]
-    """folder to write: scene/, cut/, run/, pictures/, the mesh and the page"""
+    """folder to write scene/, cut/, run/, pictures/, the mesh and the page to"""
     masks: Annotated[str, written("auto|rembg|FOLDER|none")] = AUTO
-    """where masks come from: rembg, a network; a folder of masks; none, depth alone, as of cutout;
-    auto takes those that the photographs bring, or else the network, or depth if there is none"""
-    network: choices.NetworkName = choices.NETWORK
-    """which network it is; as of cutout"""
+    """source of the masks; auto: masks in PHOTOS, else a network, else depth only"""
+    network: Annotated[choices.NetworkName, ADVANCED] = choices.NETWORK
+    """network that makes the masks; later ones are larger, slower and finer"""
     box: BoxOf = None
-    """as of cutout; the cameras are those of scene/, which --until cameras ends with"""
-    keep_table: bool = False
-    """as of cutout, with --masks none and a box"""
+    """corners of a box around the object, in the world of scene/"""
+    keep_table: Annotated[bool, ADVANCED] = False
+    """keep the table inside the box; needs --masks none"""
     preset: choices.PresetOrAuto = "auto"
-    """as of train"""
-    light: choices.LightName = "hybrid"
-    """as of train"""
+    """amount of work, from draft to best; auto: what fits --minutes, else fast"""
+    light: Annotated[choices.LightName, ADVANCED] = "hybrid"
+    """lighting model; hybrid separates shadows best, the others are for comparison"""
     minutes: Minutes = None
-    """of training, above 0; as of train"""
+    """time limit of the training; cameras and masks come on top"""
     changes: Changes = ()
-    """as of train"""
+    """change one configuration field, such as loss.radiance=0.5; repeatable"""
     until: choices.Until = "page"
-    """the last step: page is all of them; cameras or masks end before training, and the folder to
-    train on is printed"""
+    """last step; cameras and masks end before training and print the folder"""
 
     @property
     def fingerprint(self) -> Any:
@@ -80,23 +77,27 @@ class CaptureOptions:
 
 @takes(CaptureOptions)
 def command(asked: CaptureOptions) -> int:
-    """From photographs to a mesh with materials and a page, in one command.
+    """Turn photographs into a relightable object, in one command.
 
-    Finds cameras, makes masks, trains, exports DIR/DIR.glb, lights the object anew and writes
-    DIR/index.html: poses, cutout, train, export, relight and eval, one after another. What is there
-    is not made again: the same command goes on after an interruption.
+    Runs poses, cutout, train, export, relight and eval, and writes a mesh, DIR/DIR.glb, and a web
+    page, DIR/index.html. Finished steps are kept: after an interruption, run the same command again
+    to resume.
     """
+    from univoxel.run import load_verdict
+
     check_minutes(asked.minutes)
     where, until = (asked.photographs, asked.out), asked.until
     masks = {name: getattr(asked, name) for name in ("masks", "network", "box", "keep_table")}
     training = {name: getattr(asked, name) for name in ("preset", "light", "minutes")}
     if until == "page":
         made = capture(*where, **masks, **training, changes=asked.changes)
+        if verdict := load_verdict(made.run):
+            log.info("\n".join(verdict.lines()))
         print(made.page)
         print(made.mesh)
         return code_of(made.run)
     if (*training.values(), asked.changes) != ("auto", "hybrid", None, ()):
-        raise UserError(f"--until {until}: --preset, --light, --minutes, --set come after it")
+        raise UserError(f"--until {until}: --preset, --light, --minutes and --set have no effect")
     print(find_data(*where, **masks, until=until))
     return 0
 
@@ -105,9 +106,9 @@ def command(asked: CaptureOptions) -> int:
 class PicturesConfig:
     """The pictures of a capture."""
 
-    frames: int = setting(8, "of an orbit around the object, under each map", least=1)
-    resolution: int = setting(512, "of their sides", unit="pixels", least=1)
-    samples: int = setting(choices.SAMPLES, "of the light, per pixel", least=1)
+    frames: int = setting(8, "frames of an orbit, for each environment map", least=1)
+    resolution: int = setting(512, "width and height of the images", unit="pixels", least=1)
+    samples: int = setting(choices.SAMPLES, "light samples per pixel", least=1)
 
     __post_init__ = check_settings
 
@@ -133,30 +134,30 @@ def capture(
     pictures: PicturesConfig = PICTURES,
     **options: Any,
 ) -> Captured:
-    """Make an object that can be lit anew from photographs, in steps that are each kept.
+    """Turn photographs into a relightable object, in steps whose results are kept.
 
-    Below `out`: scene/ holds photographs and cameras, cut/ those with masks, run/ the training,
-    pictures/ the object under other light and measures, then the mesh and index.html. What is
-    there is not made again, so the same call goes on after an interruption. What is of one's own
-    takes the place of a step: photographs with cameras, masks, a run.
+    The folder `out` then has scene/ (photographs and cameras), cut/ (the same with masks), run/
+    (the training), pictures/ (the object under new light, and metrics), the mesh and index.html.
+    Finished steps are kept: after an interruption, call the function again to resume. If you
+    already have cameras, masks or a run, the steps that make them are skipped.
 
     Args:
-        photographs: a folder of photographs or a video; or photographs with cameras, of any layout
+        photographs: a folder of photographs or a video; or photographs with cameras, in any layout
             that `train` reads; or a trained run.
-        out: folder to write.
-        on_progress: as of `univoxel.train`.
+        out: folder to write to.
+        on_progress: as in `univoxel.train`.
         config: how cameras are found.
-        pictures: how many are made, and how large.
+        pictures: number and size of the images.
         options: fields of `univoxel.cli.capture.CaptureOptions`, such as masks, box, preset and
-            minutes; until stays page, `find_data` makes the first steps alone.
+            minutes; until must be page: for the first steps only, call `find_data`.
 
     Raises:
-        ExistingFile: out holds another capture, or what other options made.
+        ExistingFile: out holds another capture, or results of other options.
         MissingExtra: a package that finds cameras, reads a format or makes masks is missing.
         MissingNative: the compiled extension is missing or was built without Embree.
-        DataError: photographs, cameras or masks that cannot be used.
+        DataError: photographs, cameras or masks cannot be used.
         UserError: an argument cannot be used, or there is no surface.
-        ProcessFailed: finding cameras did not end well.
+        ProcessFailed: the search for cameras failed.
         Cancelled: on_progress raised it.
         OSError: a file cannot be written.
     """
@@ -169,7 +170,10 @@ def capture(
 
     asked = CaptureOptions(Path(photographs), Path(out), **options)
     if asked.until != "page":
-        raise UserError(f"until: expected page, got {asked.until}: see `find_data`", "until")
+        raise UserError(
+            f"until: expected page, got {asked.until}: call `find_data`",
+            "until",
+        )
     given, project = look_at(asked.photographs), Project(asked.out)
     training = chosen(asked.preset, asked.minutes, project.cut, project.run, asked.light)
     training = changed(training, asked.changes)
@@ -185,7 +189,7 @@ def capture(
     else:
         if not (project.run / FILE).exists():
             seconds = slowdown(training) * sum(map(expected_seconds, training.stages))
-            said = f"training takes about {duration(seconds)} on this machine"
+            said = f"the training takes about {duration(seconds)} on this machine"
             log.info(f"{said}; cameras and masks come on top")
         scene = _find_cameras(project, given, asked, config)
         data = _find_masks(project, scene, asked)
@@ -200,13 +204,13 @@ def capture(
 def find_data(
     photographs: str | Path, out: str | Path, config: CaptureConfig = DEFAULTS, **options: Any
 ) -> Path:
-    """The first steps of a capture alone; return the folder to train on. `capture` goes on with it.
+    """Run the first steps of a capture, which `capture` can resume; return the folder to train on.
 
     Args:
-        options: fields of `CaptureOptions`; until cameras, or else masks.
+        options: fields of `CaptureOptions`; until is cameras, or else masks.
 
     Raises:
-        UserError: photographs are a trained run; else as of `capture`.
+        UserError: photographs are a trained run; otherwise as in `capture`.
         OSError: a file cannot be written.
     """
     from univoxel.capture.project import Project, begin, look_at
@@ -214,7 +218,7 @@ def find_data(
     asked = CaptureOptions(Path(photographs), Path(out), **options)
     given, project = look_at(asked.photographs), Project(asked.out)
     if given.kind == "run":
-        raise UserError(f"{given.path} is a trained run: there are cameras and masks", "until")
+        raise UserError(f"{given.path} is a trained run with cameras and masks", "until")
     _check_machine(given, asked)
     begin(project, given)
     _check_network(project, asked)
@@ -227,7 +231,7 @@ def _say(step: str, what: str) -> None:
 
 
 def _skip(step: str, what: Path) -> None:
-    _say(step, f"there already, {what}")
+    _say(step, f"kept from before, {what}")
 
 
 def _check_unused(given: Given, asked: CaptureOptions, training: TrainConfig) -> None:
@@ -238,7 +242,7 @@ def _check_unused(given: Given, asked: CaptureOptions, training: TrainConfig) ->
     if asked.fingerprint != AUTO or training != usual:
         raise UserError(
             f"{given.path} is a trained run: masks, network, box, preset, minutes, light and set "
-            "come too late",
+            "have no effect on it",
             *("masks", "network", "box", "preset", "minutes", "light", "set"),
         )
 
@@ -266,12 +270,12 @@ def _check_machine(given: Given, asked: CaptureOptions) -> None:
 
 
 def _check_network(project: Project, asked: CaptureOptions) -> None:
-    """Refuse to go on with masks of single photographs that another network made."""
+    """Refuse to continue with masks of single photographs that another network made."""
     from univoxel.capture.project import SINGLE
 
     def other(before: str) -> ExistingFile:
         return ExistingFile(
-            f"{project.out} holds cameras found with masks of network={before}: choose another out",
+            f"{project.out} holds cameras found with network={before}: choose another out",
             *("network", "out"),
         )
 
@@ -296,14 +300,14 @@ def _find_cameras(
         _skip("cameras", done)
         return done
     if not files.recorded(project.out, TURNED):
-        _say("cameras", f"of {given.path}")
+        _say("cameras", f"from {given.path}")
         try:
             return poses(given.path, done, config=config)
         except StillBackground as error:
-            log.info(f"{error.seen}: the object was turned before a still camera, so masks first")
+            log.info(f"{error.seen}, as on a turntable: masks are made first")
             files.finish(project.out, TURNED, True)
     first = _masks_before_cameras(project, given, asked)
-    _say("cameras", f"of what masks show of {given.path}")
+    _say("cameras", f"from the masked part of {given.path}")
     return poses(given.path, done, masks=first, config=config)
 
 
@@ -327,11 +331,11 @@ def _masks_before_cameras(project: Project, given: Given, asked: CaptureOptions)
         return project.masks
     if masks == choices.DEPTH:
         raise UserError(
-            f"{given.path}: the object was turned before a still camera, so cameras need masks: "
-            f"expected masks={choices.REMBG} or a folder, got {masks}",
+            f"{given.path}: the background is static, as on a turntable, so finding cameras needs "
+            f"masks: expected masks={choices.REMBG} or a folder, got {masks}",
             "masks",
         )
-    _say("masks", "of single photographs, from a network")
+    _say("masks", "from a network, for each photograph")
     masked = mask_network(asked.network)
     pictures, _, _ = photographs_of(given.path, folders_of(project.scene))
     require_readers(pictures)
@@ -366,8 +370,8 @@ def _find_masks(project: Project, scene: Path, asked: CaptureOptions) -> Path:
         made = {k: " ".join(map(str, v)) if k == "box" else v for k, v in made.items()}
         words = ", ".join(f"{name}={value}" for name, value in made.items())
         return ExistingFile(
-            f"{project.cut} holds photographs with {words}: to make them anew, remove it "
-            f"and {project.run}",
+            f"{project.cut} holds photographs with {words}: to make them again, remove it and "
+            f"{project.run}",
             *made,
         )
 
@@ -379,8 +383,8 @@ def _find_masks(project: Project, scene: Path, asked: CaptureOptions) -> Path:
     if masks == AUTO and not turned and _have_masks(project, scene):
         if asked.box is not None:
             raise UserError(
-                f"{scene} brings masks, which are trained on as they are: with a box expected "
-                f"masks={choices.REMBG}, {choices.DEPTH} or their folder, got {masks}",
+                f"{scene} has masks, which training uses unchanged: with a box, expected "
+                f"masks={choices.REMBG}, {choices.DEPTH} or a folder of masks, got {masks}",
                 "masks",
             )
         _skip("masks", scene)
@@ -390,7 +394,7 @@ def _find_masks(project: Project, scene: Path, asked: CaptureOptions) -> Path:
         source = scene / "masks"  # those that the cameras were found with
     else:
         source = _network_or_depth(asked.network) if masks == AUTO else asked.masks
-    words = {choices.REMBG: "from a network", choices.DEPTH: "from depth alone"}
+    words = {choices.REMBG: "from a network", choices.DEPTH: "from depth only"}
     _say("masks", words.get(str(source), f"from {source}"))
     return cutout(
         *(scene, project.cut, source),
@@ -409,7 +413,7 @@ def _network_or_depth(name: choices.NetworkName) -> str:
     except MissingExtra as missing:
         if name != choices.NETWORK:  # which nobody names for nothing
             raise
-        log.info(f"no network is installed, so depth alone tells the object ({missing})")
+        log.info(f"no mask network is installed, so the object is found by depth only ({missing})")
         return choices.DEPTH
     return choices.REMBG
 
@@ -441,12 +445,12 @@ def _train(wanted: TrainConfig, on_progress: Callable[[TrainingProgress], None] 
     if done or begun:
         _check_trained(wanted, done)
     if not done:
-        _say("training", "goes on" if begun else f"on {data}")
+        _say("training", "resumed" if begun else f"on {data}")
         return train(wanted, resume=begun, on_progress=on_progress)
     _skip("training", run)
     newest = max((p.stat().st_mtime_ns for p in data.rglob("*.png")), default=0)
     if newest > (run / FILE).stat().st_mtime_ns:
-        log.warning(f"photographs in {data} have changed since: to train anew, remove {run}")
+        log.warning(f"photographs in {data} have changed: to train again, remove {run}")
     return run
 
 
@@ -462,8 +466,8 @@ def _check_trained(wanted: TrainConfig, done: bool) -> None:
         same = False
     if not same:
         raise ExistingFile(
-            f"{wanted.out} was trained with another preset, minutes, light or set: to train anew, "
-            "remove it, or choose another out",
+            f"{wanted.out} was trained with another preset, minutes, light or set: to train "
+            "again, remove it, or choose another out",
             *("preset", "minutes", "light", "set", "out"),
         )
 
@@ -506,19 +510,19 @@ def _picture(project: Project, run: Path, config: PicturesConfig) -> None:
     try:
         evaluate(run, save=folder / "test", json=measures)
     except DataError as error:  # such as a run whose photographs are elsewhere now
-        log.warning(f"no measures: {error}")
+        log.warning(f"no metrics: {error}")
     return None
 
 
 def _write_page(project: Project, given: Given, run: Path) -> None:
-    """Write the page of the object, which also says what lies beside it."""
+    """Write the page of the object, which also says what is beside it."""
     from univoxel.detail.texture import page_options
     from univoxel.evaluation.measures import in_words
     from univoxel.output.page import write_page
 
     beside = [
-        ("the mesh with its materials", project.mesh),
-        ("pictures with their layers", project.pictures),
+        ("the mesh with materials", project.mesh),
+        ("images with their layers", project.pictures),
         ("the masks, worst first", project.cut / "masks.html"),
     ]
     named = [
@@ -533,7 +537,7 @@ def _write_page(project: Project, given: Given, run: Path) -> None:
         run,
         project.page,
         title=project.out.absolute().name,
-        notes=f"Made of {given.words}. Beside this page lie {', '.join(named)}.",
+        notes=f"Made from {given.words}. The same folder holds {', '.join(named)}.",
         measures=in_words(known),
         **page_options(run),
     )

@@ -1,4 +1,4 @@
-"""Cut the object out of photographs without masks."""
+"""Masks for photographs whose cameras are known."""
 
 from __future__ import annotations
 
@@ -13,33 +13,29 @@ from univoxel.core.choices import NETWORK, NetworkName
 @dataclass(frozen=True)
 class CutoutOptions:
     data: Annotated[Path, written("DATA", positional=True)]
-    """folder of the photographs and their cameras; masks in it are not looked at"""
+    """folder with the photographs and their cameras; its masks are ignored"""
     out: Annotated[Path, written("DIR")]
-    """folder to write"""
+    """folder to write to"""
     source: Annotated[str, written("rembg|FOLDER|none", "rembg", name="from")] = "rembg"
-    """where masks come from: rembg, a network on single photographs; a folder of masks; or none,
-    depth alone: what stands out from its support, in the middle of what the cameras look at. Masks
-    that contradict the object in 3D are repaired"""
+    """source of the masks: a network (rembg), a folder, or none: depth only"""
     network: NetworkName = NETWORK
-    """which of rembg's networks makes them: the further down the list, the more megabytes, time and
-    detail"""
+    """network that makes the masks; later ones are larger, slower and finer"""
     box: BoxOf = None
-    """lower and upper corner, in world units of the written cameras, of a box that the object lies
-    in; outside of it nothing counts"""
+    """corners of a box around the object, in the world of the written cameras"""
     keep_table: bool = False
-    """with --from none and a box: what stands out keeps its support, within the box"""
+    """keep the table inside the box; needs --from none"""
     downscale: DownscaleBy = "auto"
-    """write photographs of 1/N of their width and height; auto as of train"""
+    """write photographs at 1/N of their size; auto: no more pixels than grids can use"""
     allow_outside: bool = False
-    """as of train"""
+    """also read files outside the folder if the data set refers to them"""
 
 
 @takes(CutoutOptions)
 def command(asked: CutoutOptions) -> Path:
-    """Cut the object out of photographs without masks.
+    """Make masks for photographs whose cameras are known.
 
-    Writes them with their alpha, and their cameras, as a new folder to train on: look at its
-    masks.html, worst first, and mend what is wrong in any image editor.
+    Writes photographs with an alpha channel and their cameras to a new folder, which you can train
+    on. Check its masks.html, which lists the worst masks first; fix wrong masks in an image editor.
     """
     from univoxel.capture.cutout import cutout
 

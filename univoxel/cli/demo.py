@@ -1,4 +1,4 @@
-"""The bundled scene from photographs to a page to light it on."""
+"""The bundled scene, from photographs to a relightable web page."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ MINUTES = 2.0  # of training: the whole takes less than twice that on two cores
 
 TITLE = "Half an avocado and a bell pepper"
 NOTES = (
-    "Trained on {photos} photographs by this machine's processor. Beside this page lie the run "
-    "(run/), its surface (mesh.ply), the test views as layers beside their truth "
-    "(test/contact_sheet.png), and the test views under two maps that training never saw "
-    "(relight/)."
+    "Trained on {photos} photographs on this machine's CPU. The same folder holds the run "
+    "(run/), its surface (mesh.ply), the test views beside the ground truth "
+    "(test/contact_sheet.png), and the test views under two environment maps that training "
+    "never saw (relight/)."
 )
 
 
 @dataclass(frozen=True)
 class DemoOptions:
     out: Annotated[Path, written("DIR")] = Path("univoxel-demo")
-    """folder for everything it writes; the page to open is DIR/index.html"""
+    """folder to write to; then open DIR/index.html"""
 
 
 @takes(DemoOptions)

@@ -1,4 +1,4 @@
-"""The albedo of a trained run again, from its photographs at their own size."""
+"""A finer albedo for a trained run, from its full-size photographs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MOST_OF_LIMIT = 0.25  # of the minutes that a training has
 
 @dataclass(frozen=True)
 class DetailOptions:
-    """Where detail comes from, and how fine it becomes.
+    """Photographs and size of the texture.
 
     Raises:
         UserError: size out of range.
@@ -33,8 +33,8 @@ class DetailOptions:
     run: Run
     """folder of a trained run"""
     data: DataOf = None
-    """folder of the photographs, where they were moved"""
-    size: Annotated[int | None, written("TEXELS", "what photographs resolve")] = None
+    """folder of the photographs, if they were moved"""
+    size: Annotated[int | None, written("TEXELS", "from the photographs' resolution")] = None
     """width of the square texture, a power of 2 from 256 to 8192"""
 
     def __post_init__(self) -> None:
@@ -47,7 +47,9 @@ class DetailOptions:
 
 @takes(DetailOptions)
 def command(asked: DetailOptions) -> Path | None:
-    """Make the detail of a run, in RUN/detail; None, with a line, where its photographs have none.
+    """Add a texture from full-size photographs to a run.
+
+    Writes RUN/detail, or nothing if the photographs are no finer than the run's grid.
 
     Raises:
         UserError: the run or its photographs cannot be read, or there is no surface.
@@ -60,7 +62,7 @@ def command(asked: DetailOptions) -> Path | None:
     data = None if asked.data is None else Path(asked.data)
     made = write(load_scene(run), photos_of(run, data, "train"), run, asked.size)
     if made is None:
-        log.info("%s gets no detail: its photographs show no more than its grid holds", run)
+        log.info("%s: no detail added: the photographs are no finer than the grid", run)
     return made
 
 
@@ -100,10 +102,10 @@ def made_after_training(
     if detail == "none":
         return None
     if until is not None and time.monotonic() > until:
-        log.info("detail: no time is left for it; make it with `univoxel detail %s`", run)
+        log.info("detail: no time was left for it; add it with `univoxel detail %s`", run)
         return None
     try:
         return write(scene, photos, run)
     except (UserError, OSError, ValueError) as error:  # a run without it is one, too
-        log.warning("detail: none is made: %s", error)
+        log.warning("detail: not added: %s", error)
         return None

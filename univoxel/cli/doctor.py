@@ -1,4 +1,4 @@
-"""Whether this installation can train, on what, and what to do about what it lacks."""
+"""Checks of the installation and the machine, with remedies."""
 
 from __future__ import annotations
 
@@ -25,9 +25,7 @@ if TYPE_CHECKING:
 State: TypeAlias = Literal["good", "look", "bad"]  # bad: training is refused
 COLORS: dict[State, str] = {"good": "green", "look": "yellow", "bad": "red"}
 REINSTALL = "pip install --force-reinstall --no-deps --only-binary univoxel univoxel"
-REBUILD = (
-    f"install a wheel that has it ({REINSTALL}), or build anew with a compiler, GLM and Embree"
-)
+REBUILD = f"install a wheel with it ({REINSTALL}), or build again with a compiler, GLM and Embree"
 DEVELOPERS = {"bench", "dev", "docs", "wheel"}  # extras that no command asks for
 ENOUGH = 4 << 30  # bytes: presets on 100 photographs of about 1000 pixels stay below
 
@@ -45,15 +43,15 @@ class Finding:
 @dataclass(frozen=True)
 class DoctorOptions:
     json: JsonFile = None
-    """file for the findings; - prints them in place of the table"""
+    """write the findings to a file; - prints them, not the table"""
 
 
 @takes(DoctorOptions)
 def command(asked: DoctorOptions) -> None:
-    """Look at this installation and machine, and say what they lack.
+    """Check this installation and this machine.
 
-    Processor and the kernels built for it, Embree, torch, OpenMP, threads, memory, extras. Ends
-    with exit code 2 where training would be refused.
+    Checks the processor and its kernels, Embree, PyTorch, OpenMP, threads, memory and optional
+    packages. If training is not possible, the exit code is 2.
     """
     import rich
 
@@ -76,7 +74,7 @@ def look() -> list[Finding]:
     return [
         Finding("univoxel", f"{__version__}, {Path(__file__).parent.parent}"),
         Finding("Python", f"{platform.python_version()}, {platform.platform()}"),
-        Finding("processor", f"{machine.processor()}, runs {status.usable[-1]}"),
+        Finding("processor", f"{machine.processor()}, supports {status.usable[-1]}"),
         kernels(status),
         embree(status),
         Finding("torch", torch_build()),
@@ -91,10 +89,10 @@ def kernels(status: NativeStatus) -> Finding:
     """Whether the compiled extension is loaded, and the best build of it."""
     if status.variant is None:
         return Finding("kernels", f"not loaded: {status.reason}", "bad", REBUILD)
-    found = f"{status.variant}, of {' '.join(status.built)}"
+    found = f"{status.variant}, out of {' '.join(status.built)}"
     if status.variant == status.usable[-1]:
         return Finding("kernels", found)
-    faster = f"this processor runs {status.usable[-1]}, which is not there: {REBUILD}"
+    faster = f"this processor supports {status.usable[-1]}, but there is no build for it: {REBUILD}"
     return Finding("kernels", found, "look", faster)
 
 
@@ -102,7 +100,12 @@ def embree(status: NativeStatus) -> Finding:
     """Whether rays can be traced."""
     if status.embree is not None:
         return Finding("Embree", f"{status.embree}")
-    return Finding("Embree", "none: no rays, so no training and no relighting", "bad", REBUILD)
+    return Finding(
+        "Embree",
+        "missing: training and relighting need it",
+        "bad",
+        REBUILD,
+    )
 
 
 def openmp(runtimes: Sequence[str]) -> Finding:
@@ -110,7 +113,7 @@ def openmp(runtimes: Sequence[str]) -> Finding:
     found = ", ".join(runtimes) or "none"
     if len(runtimes) <= 1:
         return Finding("OpenMP", found)
-    remedy = "two slow each other down: import univoxel before what brings the second"
+    remedy = "two slow each other down: import univoxel before the package that loads the second"
     return Finding("OpenMP", found, "look", remedy)
 
 
@@ -119,9 +122,7 @@ def threads(count: int, cores: float) -> Finding:
     asked = os.environ.get("OMP_NUM_THREADS")
     found = f"{count} on {cores:g} cores" + (f", OMP_NUM_THREADS={asked}" if asked else "")
     if count > max(cores, 1):
-        remedy = (
-            f"more threads than cores wait for one another: OMP_NUM_THREADS={max(int(cores), 1)}"
-        )
+        remedy = f"fewer threads are faster: set OMP_NUM_THREADS={max(int(cores), 1)}"
         return Finding("threads", found, "look", remedy)
     return Finding("threads", found)
 
@@ -143,12 +144,12 @@ def extra_findings() -> list[Finding]:
     """A finding for each extra."""
     known = extras()
     if known is None:
-        return [Finding("extras", "unknown: the package is not installed, only on the path")]
+        return [Finding("extras", "unknown: the package is on the path, but not installed")]
     found = []
     for name, missing in known.items():
         finding = Finding(f"extra {name}", "installed")
         if missing:
-            remedy = f'where a command asks for it: pip install "univoxel[{name}]"'
+            remedy = f'if a command needs it: pip install "univoxel[{name}]"'
             finding = Finding(finding.what, f"without {', '.join(missing)}", "look", remedy)
         found.append(finding)
     return found
@@ -194,7 +195,7 @@ def torch_build() -> str:
 
 
 def extras(distribution: str = "univoxel") -> dict[str, list[str]] | None:
-    """Packages that are missing of each extra for users; None where nothing is installed."""
+    """Packages that are missing of each extra for users; None if nothing is installed."""
     try:
         requirements = metadata.requires(distribution) or []
     except metadata.PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""The recovered environment map as a file, and how far it is from the true one."""
+"""The recovered environment map as a file, and its difference from the true one."""
 
 from __future__ import annotations
 
@@ -19,37 +19,35 @@ class EnvmapOptions:
     run: Run
     """folder of a trained run"""
     out: Annotated[File, written("FILE.exr|hdr")]
-    """the map, linear radiance, in 32 bits a channel as .exr, a pixel as .hdr; a picture of it goes
-    beside, with the true map if the data set has it"""
+    """environment map to write, in linear radiance; a preview is written beside it"""
     height: Annotated[int, written("ROWS")] = MAP_ROWS
-    """rows of the map; it is twice as wide"""
+    """rows of the map; it has twice as many columns"""
     light_of: LightOf = None
-    """training view, by name or number, whose map it is, where the run was trained with
-    --varying"""
+    """training view whose light to write, by name or number; see train --varying"""
 
 
 @takes(EnvmapOptions)
 def command(asked: EnvmapOptions) -> None:
-    """Write the light of the photographs as an environment map."""
+    """Write the recovered light as an environment map."""
     found = envmap(**vars(asked))
     print(asked.out)
     if found:
-        print(f"grey ball under it: PSNR {found.ball_psnr:.1f} dB, a scale per channel")
-        print(f"mirror ball under it: PSNR {found.mirror_psnr:.1f} dB")
+        print(f"diffuse sphere under it: PSNR {found.ball_psnr:.1f} dB, after a scale per channel")
+        print(f"chrome sphere under it: PSNR {found.mirror_psnr:.1f} dB")
         print(f"brightest directions: {found.brightest_degrees:.1f} degrees apart")
 
 
 @takes(EnvmapOptions)
 def envmap(asked: EnvmapOptions) -> Comparison | None:
-    """Write the recovered map of a run, and a picture of it beside; compare it with the true one.
+    """Write the recovered environment map of a run and a preview; compare it with the true map.
 
-    Light and albedo share a factor per channel that photographs hardly fix; the comparison takes it
-    out, the file holds the map as it is. The true map is envmaps/train.hdr or .exr in the data set.
-    The picture goes to the same name with .png: a row for the recovered map and one for the true
-    map, each with a grey and a mirror ball seen from +X, +Z up.
+    Photographs cannot separate the scale of light and albedo, per channel: the comparison removes
+    this scale, but the file holds the map as recovered. The true map is envmaps/train.hdr or .exr
+    in the data set. The preview, a .png of the same name, has a row for the recovered and one for
+    the true map, each with a diffuse and a chrome sphere seen from +X, with +Z up.
 
     Returns:
-        None where the data set has no true map.
+        None if the data set has no true map.
 
     Raises:
         DataError: run or true map cannot be read.

@@ -1,4 +1,4 @@
-"""A trained scene against the truth of its test views: the measures, and pictures of them."""
+"""Metrics of a trained scene on its test views, and images of them."""
 
 from __future__ import annotations
 
@@ -30,30 +30,26 @@ class EvaluateOptions:
     run: parsing.Run
     """folder of a trained run"""
     data: parsing.DataOf = None
-    """folder of the photographs"""
+    """folder of the photographs, if they were moved"""
     save: Annotated[parsing.File | None, parsing.written("DIR", "none are written")] = None
-    """folder for the rendered pictures"""
+    """folder to write the rendered images to"""
     json: parsing.JsonFile = None
-    """file for the measures; - prints them in place of the table"""
+    """write the metrics to a file; - prints them, not the table"""
     samples: int = SAMPLES
-    """of the light, per pixel of relit pictures"""
-    bounces: int = BOUNCES
-    """reflections between parts of the object in relit pictures, 0 for none"""
+    """light samples per pixel of relit images"""
+    bounces: Annotated[int, parsing.ADVANCED] = BOUNCES
+    """light bounces between parts of the object in relit images"""
     light_of: parsing.LightOf = None
-    """training view, by name or number, in whose light novel views are rendered, where the run was
-    trained with --varying"""
-    test_every: Annotated[int | None, parsing.written("N", "the test split")] = None
-    """measure the first of every so many photographs, in order of all names; none of them may have
-    been trained on"""
-    background: Behind = "black"
-    """what novel views are composited on"""
-    fit_light: bool = False
-    """render each novel view in the light in which it looks most like its photograph, as the field
-    does where light differs from photograph to photograph"""
+    """training view whose light to render in, by name or number; see train --varying"""
+    test_every: Annotated[int | None, parsing.written("N", "the test split", advanced=True)] = None
+    """use every Nth photograph as a test view; none may be a training photograph"""
+    background: Annotated[Behind, parsing.ADVANCED] = "black"
+    """background of the novel views"""
+    fit_light: Annotated[bool, parsing.ADVANCED] = False
+    """fit the light to each test photograph before measuring, as many papers do"""
 
     full_size: bool = False
-    """measure novel views at the full size of the photographs too, with the run's detail: PSNR,
-    SSIM, and how much of the photographs' detail they show, octave by octave"""
+    """also measure novel views at the photographs' full size, with the run's detail"""
 
     def __post_init__(self) -> None:
         if self.samples < 1 or self.bounces < 0:
@@ -64,12 +60,12 @@ class EvaluateOptions:
                 "bounces",
             )
         if self.fit_light and self.light_of is not None:
-            raise UserError("light_of and fit_light exclude one another", "light_of", "fit_light")
+            raise UserError("expected light_of or fit_light, got both", "light_of", "fit_light")
 
 
 @parsing.takes(EvaluateOptions)
 def command(asked: EvaluateOptions) -> None:
-    """Measure a run on the test views and print the table."""
+    """Measure a run on its test views."""
     import rich
 
     with parsing.json_file(asked.json) as file:
@@ -80,7 +76,7 @@ def command(asked: EvaluateOptions) -> None:
 
 @parsing.takes(EvaluateOptions, gradients=False)
 def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
-    """Measures of a trained scene on its test views, by the keys of `MEASURES`.
+    """Metrics of a trained scene on its test views, with the keys of `MEASURES`.
 
     Arguments are the fields of `EvaluateOptions`. Pictures are compared as sRGB in [0, 1], whole
     image, composited on black, novel views on `background`. Numbers are means over the views (and
@@ -94,7 +90,7 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
     doubt.roughness in [0, 1], 0 where nothing is; alpha; depth along -Z, 0 where nothing is. With
     `full_size` NAME_full.exr comes beside it, rgb.* and alpha at the size of the photograph, and
     the keys of `univoxel.detail.views.FULL_MEASURES` are in the result. The
-    file `json` holds the measures; `complete` and `verdict`, how training came out, None where that
+    file `json` holds the measures; `complete` and `verdict`, how training came out, None if that
     is not known; and the figures of trust.txt under the key trust.
 
     Raises:
@@ -154,12 +150,12 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
 
 
 def table(result: dict[str, float | int | None]) -> Table:
-    """The measures as the command prints them."""
+    """The metrics that have a value, as the command prints them."""
     from rich.table import Table
 
     from univoxel.evaluation.measures import MEASURES
 
-    rows = Table("measure", "meaning", "value", title="Test views")
+    rows = Table("key", "metric", "value", title="Test views")
     rows.columns[2].justify = "right"
     known = MEASURES
     if "full_psnr" in result:
@@ -167,9 +163,8 @@ def table(result: dict[str, float | int | None]) -> Table:
 
         known = MEASURES | FULL_MEASURES
     for key, meaning in known.items():
-        value = result[key]
-        text = "-" if value is None else f"{value:.4g}" if isinstance(value, float) else f"{value}"
-        rows.add_row(key, meaning, text)
+        if (value := result[key]) is not None:
+            rows.add_row(key, meaning, f"{value:.4g}" if isinstance(value, float) else f"{value}")
     return rows
 
 
@@ -182,8 +177,8 @@ def _at_full_size(
 
     try:
         train = photos_of(run, data, "train")
-    except (UserError, OSError) as error:  # views are the model's alone
-        log.info("full size: no photographs nearby: %s", error)
+    except (UserError, OSError) as error:  # views are the model's only
+        log.info("full size: novel views without photographs: %s", error)
         train = None
     return dict(measure_full_size(scene, run, photos, train, save))
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from univoxel.cli.parsing import File, Run, takes, written
+from univoxel.cli.parsing import ADVANCED, File, Run, takes, written
 from univoxel.core import choices
 from univoxel.errors import UserError
 
@@ -37,27 +37,25 @@ class ExportOptions:
     run: Run
     """folder of a trained run"""
     mesh: Annotated[File, written("FILE.glb|usdz|obj|ply")]
-    """the file to write: .glb, .usdz and .obj hold textures, .ply materials at the vertices"""
+    """mesh file to write; .glb, .usdz and .obj have textures, .ply vertex colours"""
     faces: Annotated[int | None, written("N", "20000 with textures, all without")] = None
-    """most triangles, at least 4"""
+    """maximum number of triangles, at least 4"""
     texture_size: Annotated[
-        int | None, written("TEXELS", "what the photographs resolve, 1024 without detail")
+        int | None, written("TEXELS", "from the photographs, 1024 without detail")
     ] = None
     """width of the square textures, a power of 2 up to 4096"""
     watertight: bool = False
-    """close holes, or fail"""
-    texture_format: choices.TextureFormat = "png"
-    """png loses nothing, jpeg is smaller"""
-    quality: Annotated[int, written("1-95")] = choices.TEXTURE_QUALITY
-    """of textures as jpeg"""
+    """close all holes, or fail"""
+    texture_format: Annotated[choices.TextureFormat, ADVANCED] = "png"
+    """png is lossless, jpeg is smaller"""
+    quality: Annotated[int, written("1-95", advanced=True)] = choices.TEXTURE_QUALITY
+    """JPEG quality"""
     size: Annotated[float | None, written("METRES", "as photographed")] = None
-    """what the longest side of the object becomes"""
-    origin: choices.Origin = "upright"
-    """what lies at 0: the origin of the data set with +Z up, the same in the data set's own world,
-    as its cameras have it; the middle of the object's floor, or its centre"""
-    lods: Annotated[int, written("N")] = 0
-    """coarser levels of detail to write beside, FILE_lod1 and so on: each has a quarter of the
-    triangles, and textures of half the width"""
+    """length of the object's longest side"""
+    origin: Annotated[choices.Origin, ADVANCED] = "upright"
+    """origin: the data set's, with +Z up or as its files have it; floor or centre"""
+    lods: Annotated[int, written("N", advanced=True)] = 0
+    """also write N coarser levels, each with a quarter of the triangles"""
 
     def __post_init__(self) -> None:
         if self.faces is not None and self.faces < 4:
@@ -94,8 +92,8 @@ def require_levels(faces: int, lods: int) -> None:
     coarsest = faces // FEWER**lods
     if coarsest < LEAST_FACES:
         raise UserError(
-            f"export: lods={lods} of {faces} faces leave {coarsest} in the coarsest level, expected"
-            f" at least {LEAST_FACES}",
+            f"export: lods={lods} with {faces} faces leaves {coarsest} in the coarsest level, "
+            f"expected at least {LEAST_FACES}",
             "lods",
         )
 
@@ -107,7 +105,7 @@ def level_path(mesh: Path, level: int) -> Path:
 
 @takes(ExportOptions)
 def export(asked: ExportOptions) -> list[Path]:
-    """Write the surface as a mesh with its materials, for any renderer.
+    """Export the surface as a mesh with materials.
 
     Returns:
         The files of the levels of detail, the finest first, each written whole or not at all.

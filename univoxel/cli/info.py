@@ -1,4 +1,4 @@
-"""What a trained model consists of: parameters and bytes by part, and what was chosen for it."""
+"""Parts of a trained model with their parameters and bytes, and the sizes chosen for it."""
 
 from __future__ import annotations
 
@@ -50,17 +50,17 @@ class InfoOptions:
     run: Run
     """folder of a trained run"""
     json: JsonFile = None
-    """file for the numbers; - prints them in place of tables"""
+    """write the numbers to a file; - prints them, not the tables"""
     picture: Annotated[File | None, written("FILE.png", "none")] = None
-    """where the grid's nodes are that hold features, and a bar of bytes by part"""
+    """draw where the grid stores features, and the size of each part"""
 
 
 @takes(InfoOptions)
 def command(asked: InfoOptions) -> None:
-    """Say what a model consists of, and what was chosen for it.
+    """Show the verdict, the parts and the sizes of a run.
 
-    Parameters and bytes by part, and sizes. Also whether points that are matched between the
-    photographs lie where the cameras put them.
+    Lists parameters and bytes by part, and the epipolar error of points that are matched between
+    the photographs.
     """
     import rich
     from rich.text import Text
@@ -77,17 +77,17 @@ def command(asked: InfoOptions) -> None:
 
 @takes(InfoOptions)
 def info(asked: InfoOptions) -> dict[str, Any]:
-    """What the model of a run takes up and where, and whether photographs agree with its cameras.
+    """Sizes of the model of a run, and the epipolar error of its cameras.
 
-    Parameters are the learned numbers that the file holds: distances and features of the nodes it
-    stores, weights, light. Row numbers and directions of the map are bytes, and no parameters.
+    Parameters are the learned numbers in the file: distances and features of the stored nodes,
+    weights and light. Row numbers and directions of the map count as bytes only.
 
     Returns:
         JSON: `parameters`, `bytes`, `parts` (name: parameters and bytes), `grid` (size, voxel_size,
         nodes, and shares of them: with distances, with features), `channels`,
-        `material_channels`, `hidden`, `lobes` (None where there are none), `chosen`: what,
+        `material_channels`, `hidden`, `lobes` (None if there are none), `chosen`: what,
         before, after, cost in dB and why; `cameras`, see `camera_check`; `said`,
-        how training came out in words, `result`, as verdict.json has it, None where it has not.
+        how training came out in words, `result`, as verdict.json has it, None if it has not.
 
     Raises:
         UserError: no model there, or one that cannot be read.
@@ -106,9 +106,9 @@ def info(asked: InfoOptions) -> dict[str, Any]:
     found["bytes"] = (run / FILE).stat().st_size
     found["cameras"] = camera_check(scene, run)
     verdict = load_verdict(run)
-    unknown = "Result: unfinished, training has not ended. What helps: train it with --resume"
+    unknown = "Result: unfinished, training has not ended. To improve it: use --resume"
     if (run / "trust.txt").exists():
-        unknown = "Result: not judged, because a version before 0.3 trained it"
+        unknown = "Result: unknown, because a version before 0.3 trained the run"
     found["said"] = unknown if verdict is None else verdict.sentence()
     found["result"] = None if verdict is None else as_json(verdict)
     for path in (json, picture):
@@ -122,10 +122,9 @@ def info(asked: InfoOptions) -> dict[str, Any]:
 
 
 def camera_check(scene: Scene, run: Path) -> dict[str, Any] | None:
-    """How far points that are matched between the photographs of a run lie from their epipolar
-    lines: `matches`, `refined`, and `given` and `used` (median and 90 %, pixels) for the cameras as
-    they were given and as the scene has them. None where too few points match, or where the
-    photographs cannot be read any more."""
+    """Epipolar error of points that are matched between the photographs of a run: `matches`,
+    `refined`, and `given` and `used` (median and 90 %, pixels) for the given cameras and those of
+    the scene. None if too few points match, or the photographs cannot be read."""
     from univoxel.preparation.hull import mask_distances
     from univoxel.preparation.matches import agreement, find_matches
     from univoxel.run import photos_of
@@ -134,7 +133,7 @@ def camera_check(scene: Scene, run: Path) -> dict[str, Any] | None:
         photos = photos_of(run, split="train")
         used = scene.registered(photos).cameras
     except UserError as error:
-        log.info("cameras are not checked: %s", error)
+        log.info("cameras were not checked: %s", error)
         return None
     matches = find_matches(photos, mask_distances(photos.coverage(), photos.cameras))
     given, after = (agreement(cameras, matches) for cameras in (photos.cameras, used))
@@ -204,7 +203,7 @@ def tables(found: dict[str, Any]) -> Iterable[Table | str]:
         share = f"{part['bytes'] / whole:.1%}"
         table.add_row(name, f"{part['parameters']:,}", f"{part['bytes']:,}", share)
     table.add_section()
-    table.add_row("all", f"{found['parameters']:,}", f"{found['bytes']:,}", "with the file's head")
+    table.add_row("all", f"{found['parameters']:,}", f"{found['bytes']:,}", "with the file header")
     yield table
     grid = found["grid"]
     table = Table("size", "value", title="Sizes")
@@ -212,16 +211,16 @@ def tables(found: dict[str, Any]) -> Iterable[Table | str]:
     x, y, z = grid["size"]
     table.add_row("nodes of the grid", f"{x} x {y} x {z}")
     table.add_row("voxel, world units", f"{grid['voxel_size']:.4g}")
-    table.add_row("nodes with a distance of their own", f"{grid['share_with_distance']:.1%}")
+    table.add_row("nodes with their own distance", f"{grid['share_with_distance']:.1%}")
     table.add_row("nodes with features", f"{grid['share_with_features']:.1%}")
     table.add_row("feature channels", f"{found['channels']}")
-    table.add_row("of them for materials", f"{found['material_channels']}")
-    table.add_row("hidden units of a layer", f"{found['hidden']}")
-    table.add_row("lobes of light", "-" if found["lobes"] is None else f"{found['lobes']}")
+    table.add_row("features used for materials", f"{found['material_channels']}")
+    table.add_row("hidden units per layer", f"{found['hidden']}")
+    table.add_row("light lobes", "-" if found["lobes"] is None else f"{found['lobes']}")
     yield table
     if found["cameras"] is None:
         return
-    title = "Matched points off their epipolar lines, pixels"
+    title = "Epipolar error of matched points, pixels"
     table = Table("cameras", "median", "90 %", title=title)
     for column in table.columns[1:]:
         column.justify = "right"

@@ -1,4 +1,4 @@
-"""The light that falls on one point of a trained scene, as a picture."""
+"""The light that reaches one point of a trained scene, as an image."""
 
 from __future__ import annotations
 
@@ -23,23 +23,22 @@ class InspectOptions:
     run: Run
     """folder of a trained run"""
     view: Annotated[str, written("VIEW")]
-    """name or number of a test view"""
+    """test view, by name or number"""
     pixel: Pixel
-    """whose surface point; 0,0 is the top left"""
+    """pixel of the surface point; 0,0 is the top left"""
     out: Annotated[File | None, written("FILE.png", "in RUN/inspect")] = None
-    """the picture; an .exr file with the layers goes beside"""
+    """image to write; its layers are written beside it as .exr"""
     height: Annotated[int, written("ROWS")] = MAP_ROWS
-    """of the lat-long pictures"""
+    """rows of the environment maps in the image"""
     light_of: LightOf = None
-    """training view, by name or number, whose light it is, where the run was trained with
-    --varying"""
+    """training view whose light to draw, by name or number; see train --varying"""
 
 
 @takes(InspectOptions, gradients=False)
 def inspect(asked: InspectOptions) -> Path:
-    """Draw the light that falls on one point of the surface.
+    """Draw the light that reaches one point of the surface.
 
-    The truth stands beside it where it is known.
+    If the data set has ground truth, its light is drawn beside it.
 
     Raises:
         DataError: the run or its data cannot be read.

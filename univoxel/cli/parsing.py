@@ -1,6 +1,6 @@
-"""Arguments of the command line: which command is meant, how options are written, completion.
+"""Arguments of the command line: commands, options, help and shell completion.
 
-The options of a command are a record: what stands under a field is its help.
+The options of a command are a record; the docstring under a field is its help.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from typing import (
     TypeVar,
     Union,
     get_args,
+    get_origin,
     get_type_hints,
 )
 
@@ -39,8 +40,10 @@ Result: TypeAlias = int | Path | Sequence[Path] | None
 Command: TypeAlias = Callable[..., Result]
 Shell: TypeAlias = Literal["bash", "zsh", "fish"]
 
-LAB = "lab"  # the word before commands of the laboratory
-WIDTH = 79  # of the overview
+LAB = "lab"  # the word before commands of the experiments
+WIDTH, COLUMN = 100, 22  # of help, and where texts begin in it
+GROUPED = 12  # arguments; commands with more list the advanced ones apart
+UNSAID = {"default: None", "default: False", "default: ", "default: none", "repeatable"}
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,7 @@ class Written:
     name: str | None = None  # without dashes, if it is not the field's
     positional: bool = False
     repeatable: bool = False
+    advanced: bool = False  # help lists it after the others
 
 
 def written(metavar: str | None = None, default: str | None = None, **other: Any) -> Written:
@@ -60,25 +64,28 @@ def written(metavar: str | None = None, default: str | None = None, **other: Any
     return Written(metavar, **hint, **other)
 
 
+ADVANCED = Written(advanced=True)
+
 # Options of several commands
-File: TypeAlias = Path | str  # text in the library alone: the command line makes paths
+File: TypeAlias = Path | str  # text in the library only: the command line makes paths
 Run: TypeAlias = Annotated[File, written("RUN", positional=True)]
 AtOnce: TypeAlias = Annotated[int, written("N")]
-Scheduler: TypeAlias = Annotated[str | None, written("ADDRESS", "this machine")]
+Scheduler: TypeAlias = Annotated[str | None, written("ADDRESS", "this machine", advanced=True)]
 Scenes: TypeAlias = Annotated[
     tuple[Path, ...], Written("SCENE [SCENE ...]", "(required)", positional=True)
 ]
 Changes: TypeAlias = Annotated[
-    tuple[str, ...], Written("FIELD=VALUE", "(repeatable)", "set", repeatable=True)
+    tuple[str, ...],
+    Written("FIELD=VALUE", "(repeatable)", "set", repeatable=True, advanced=True),
 ]
 Minutes: TypeAlias = Annotated[float | None, written("MINUTES", "none")]
-ConfigFile: TypeAlias = Annotated[Path | None, written("FILE", "what --preset says")]
+ConfigFile: TypeAlias = Annotated[Path | None, written("FILE", "from --preset", advanced=True)]
 JsonFile: TypeAlias = Annotated[File | None, written("FILE|-", "none")]
-LightOf: TypeAlias = Annotated[str | None, written("VIEW", "the mean of all")]
+LightOf: TypeAlias = Annotated[str | None, written("VIEW", "the mean of all", advanced=True)]
 
 DataOf: TypeAlias = Annotated[File | None, written("DATA", "the data trained on")]
 Title: TypeAlias = Annotated[str | None, written("TEXT", "the folder's name")]
-BoxOf: TypeAlias = Annotated[Box | None, written("X0 Y0 Z0 X1 Y1 Z1", "none")]
+BoxOf: TypeAlias = Annotated[Box | None, written("X0 Y0 Z0 X1 Y1 Z1", "none", advanced=True)]
 DownscaleBy: TypeAlias = Annotated[Downscale, written("auto|N")]
 
 STDOUT = Path("-")  # as a file for JSON: print it, and it alone
@@ -91,11 +98,11 @@ T = TypeVar("T")
 @dataclass(frozen=True)
 class Common:
     quiet: bool = False
-    """say nothing but results, warnings and errors"""
+    """print only results, warnings and errors"""
     verbose: bool = False
-    """say more, with the seconds since the beginning, and where an error came from"""
-    threads: Annotated[int | None, written("N", "one for each core")] = None
-    """on which kernels and torch run"""
+    """print details, elapsed seconds, and the origin of an error"""
+    threads: Annotated[int | None, written("N", "one per core")] = None
+    """number of threads"""
 
 
 @dataclass(frozen=True)
@@ -118,7 +125,7 @@ def parse(
 
     Args:
         commands: by name.
-        prefix: what stands before their names.
+        prefix: what is before their names.
 
     Raises:
         Usage: they make no command.
@@ -128,9 +135,12 @@ def parse(
         near = difflib.get_close_matches(name, commands, n=1)
         perhaps = f"; perhaps you meant {near[0]}" if near else ""
         raise Usage(f"no command {name!r}{perhaps}; see univoxel {prefix}--help")
+    program, said = f"univoxel {prefix}{name}", io.StringIO()
+    if {"-h", "--help"} & set(rest):
+        print(help_of(program, commands[name]))
+        return None
     import tyro
 
-    program, said = f"univoxel {prefix}{name}", io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
             run, common = tyro.cli(
@@ -139,10 +149,11 @@ def parse(
                 args=rest,
                 config=(tyro.conf.FlagCreatePairsOff,),
             )
-    except SystemExit as end:
-        if not end.code:
-            return None
-        raise Usage(f"{gist(said.getvalue())}; see {program} --help") from None
+    except SystemExit:
+        wrong = gist(said.getvalue())
+        if wrong.startswith("Missing from "):
+            wrong = f"expected {usage(program, commands[name])}"
+        raise Usage(f"{wrong}; see {program} --help") from None
     if common.quiet and common.verbose:
         raise Usage(f"expected --quiet or --verbose, got both; see {program} --help")
     if common.threads is not None and common.threads < 1:
@@ -195,10 +206,10 @@ def documentation(command: Command) -> str:
 
 
 def meanings(record: type) -> dict[str, str]:
-    """What stands under each field of a record, in one line; nothing where there is no source.
+    """What is under each field of a record, in one line; nothing if there is no source.
 
     Args:
-        record: a class that stands in one file with its bases.
+        record: a class that is in one file with its bases.
     """
     try:
         tree = ast.parse(inspect.getsource(sys.modules[record.__module__]))
@@ -236,14 +247,57 @@ def deferred(command: Command) -> Callable[..., tuple[functools.partial[Result],
     return prepare
 
 
+def shown(name: str, hint: Any) -> tuple[Written, str, str]:
+    """How an argument is marked; its flag, empty if it has none; and the values it takes."""
+    found = [mark for mark in getattr(hint, "__metadata__", ()) if isinstance(mark, Written)]
+    mark, kind = found[0] if found else Written(), hint
+    while get_origin(kind) is not Literal and get_args(kind):
+        kind = get_args(kind)[0]
+    names = {bool: "", int: "N", float: "NUMBER"}
+    values = mark.metavar or "|".join(map(str, get_args(kind))) or names.get(kind, "TEXT")
+    return mark, "" if mark.positional else "--" + (mark.name or name).replace("_", "-"), values
+
+
+def usage(program: str, command: Command) -> str:
+    """A command with the arguments that it requires."""
+    required = [p for p in inspect.signature(command).parameters.values() if p.default is p.empty]
+    parts = [shown(p.name, hints_of(command)[p.name])[1:] for p in required]
+    return " ".join([program, *(part for pair in parts for part in pair if part)])
+
+
+def help_of(program: str, command: Command) -> str:
+    """The text that `--help` prints: usage, description, and arguments in groups."""
+    told = deferred(command)
+    what, _, listed = (told.__doc__ or "").partition("\n\nArgs:\n")
+    texts = dict(re.findall(r"^    (\w+): (.*(?:\n     .*)*)", listed, re.MULTILINE))
+    hints = hints_of(command) | get_type_hints(Common, include_extras=True)
+    parameters = inspect.signature(told).parameters.values()
+    names = "arguments", "options", "advanced options", "common options"
+    groups: dict[str, list[str]] = {name: [] for name in names}
+    for p in parameters:
+        mark, flag, values = shown(p.name, hints[p.name])
+        grouped = mark.advanced and len(parameters) > GROUPED
+        group = names[3 if p.name in Common.__annotations__ else 2 if grouped else 1 if flag else 0]
+        value = " ".join(p.default) if isinstance(p.default, tuple) else p.default
+        hint = mark.hint or ("(required)" if value is p.empty else f"(default: {value})")
+        if not flag or hint.strip("()") in UNSAID:
+            hint = ""
+        first = f"  {flag} {values}".rstrip() if flag else f"  {values}"
+        lines = textwrap.wrap(f"{texts[p.name]} {hint}", WIDTH - COLUMN, break_on_hyphens=False)
+        lines.insert(0, first if len(first) + 2 > COLUMN else first.ljust(COLUMN) + lines.pop(0))
+        groups[group].append(f"\n{'':{COLUMN}}".join(lines))
+    parts = [f"usage: {usage(program, command)} [OPTIONS]", what]
+    parts += ["\n".join([f"{name}:", *rows]) for name, rows in groups.items() if rows]
+    return "\n\n".join(parts)
+
+
 def _for_tyro(hint: Any) -> Any:
     """A type with how it is written, as tyro is told it."""
     from tyro.conf import Positional, UseAppendAction, arg
 
-    found = [mark for mark in getattr(hint, "__metadata__", ()) if isinstance(mark, Written)]
-    if not found:
+    if (mark := shown("", hint)[0]) == Written():
         return hint
-    kind, (mark,) = get_args(hint)[0], found
+    kind = get_args(hint)[0]
     if mark.positional:
         kind = Positional[kind]
     if mark.repeatable:
@@ -273,7 +327,6 @@ def overview(title: str, groups: Mapping[str, Mapping[str, Command]], end: str) 
         lines.append(f"{group}:")
         for name, command in commands.items():
             what = (inspect.getdoc(command) or "").partition("\n")[0].rstrip(".")
-            what = textwrap.shorten(what, WIDTH - width - 4, placeholder=" ...")
             lines.append(f"  {name:<{width}}  {what}")
     return "\n".join([*lines, end])
 
@@ -282,14 +335,14 @@ def completion(shell: Shell, commands: Mapping[str, Command], lab: Mapping[str, 
     """The script that makes a shell complete commands, options and their choices.
 
     Args:
-        lab: commands of the laboratory; none where it is not there.
+        lab: commands of the experiments; none where it is not there.
     """
 
     import tyro
     from tyro.conf import ConsolidateSubcommandArgs, FlagCreatePairsOff, OmitSubcommandPrefixes
 
     def laboratory(command):
-        """Commands of the laboratory."""
+        """Commands of the experiments."""
 
     if lab:
         laboratory.__annotations__["command"] = Annotated[_union(lab), OmitSubcommandPrefixes]

@@ -1,4 +1,4 @@
-"""Find the cameras of photographs."""
+"""Find the camera poses of photographs."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
-from univoxel.cli.parsing import takes, written
+from univoxel.cli.parsing import ADVANCED, takes, written
 from univoxel.core.choices import FEATURE_SIZE, KEEP_SIZE
 from univoxel.errors import UserError
 
@@ -14,35 +14,33 @@ from univoxel.errors import UserError
 @dataclass(frozen=True)
 class PosesOptions:
     photographs: Annotated[Path, written("PHOTOS", positional=True)]
-    """folder of JPEG, PNG, TIFF, WebP, HEIC or RAW, held either way; or a video"""
+    """folder of JPEG, PNG, TIFF, WebP, HEIC or RAW photographs; or a video"""
     out: Annotated[Path, written("SCENE")]
-    """folder to write; its folder sfm/ keeps the steps and is of no use afterwards"""
-    masks: Annotated[Path | None, written("DIR", "the whole pictures")] = None
-    """folder with a mask for each photograph, white on the object: features are sought within them
-    alone, as a turntable needs it"""
+    """folder to write to; delete its sfm/ when you are done"""
+    masks: Annotated[Path | None, written("DIR", "the whole images")] = None
+    """folder of masks; only pixels inside them count, as a turntable requires"""
     every: Annotated[float | None, written("SECONDS", "80 frames in all")] = None
-    """of a video, the sharpest frame of each so many seconds is taken"""
-    keep_size: Annotated[int, written("PIXELS")] = KEEP_SIZE
-    """most pixels along the longer side of written photographs; 0: as they are"""
-    keep_weak: bool = False
-    """write photographs too whose cameras may be off by degrees"""
-    size: Annotated[int, written("PIXELS")] = FEATURE_SIZE
-    """pixels along the longer side, in which features are sought"""
-    features: Annotated[int | None, written("N", "4096; with --fast: 2048")] = None
-    """most of a photograph"""
+    """take the sharpest frame of a video in each period of SECONDS"""
+    keep_size: Annotated[int, written("PIXELS", advanced=True)] = KEEP_SIZE
+    """maximum longer side of the photographs to write; 0: original size"""
+    keep_weak: Annotated[bool, ADVANCED] = False
+    """keep photographs with unreliable poses"""
+    size: Annotated[int, written("PIXELS", advanced=True)] = FEATURE_SIZE
+    """longer side at which to detect features"""
+    features: Annotated[int | None, written("N", "4096; with --fast: 2048", advanced=True)] = None
+    """maximum number of features per photograph"""
     fast: bool = False
-    """fewer features, of larger details alone, in a quarter of the time; loses photographs of
-    smooth objects"""
-    seed: int = 0
-    """of all random choices"""
+    """four times faster with fewer features; may lose views of smooth objects"""
+    seed: Annotated[int, ADVANCED] = 0
+    """random seed"""
 
 
 @takes(PosesOptions)
 def command(asked: PosesOptions) -> Path:
-    """Find the cameras of photographs, or of the frames of a video.
+    """Find the camera poses of photographs or of a video.
 
-    Writes them upright, with their cameras, as a new folder to train on, in COLMAP's layout. The
-    same command again goes on after an interruption.
+    Writes upright photographs and their cameras to a new folder, in COLMAP's layout, which you can
+    train on. After an interruption, run the same command again to resume.
     """
     from univoxel.capture.config import DEFAULTS, FAST
     from univoxel.capture.poses import poses

@@ -1,4 +1,4 @@
-"""A trained scene under new light, from the test views, an orbit or given cameras."""
+"""Render a trained scene under new light, from the test views, an orbit or given cameras."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from univoxel.cli.parsing import Run, takes, written
+from univoxel.cli.parsing import ADVANCED, Run, takes, written
 from univoxel.core.choices import BOUNCES, ELEVATION, SAMPLES, Animation, Background, Ground
 from univoxel.errors import UserError
 
@@ -26,19 +26,19 @@ NO_MAP = "lights"  # name of light without a map
 
 @dataclass(frozen=True, kw_only=True)
 class Where:
-    """What is relit, and where the pictures go."""
+    """The run and its light, and where to write the images."""
 
     run: Run
     """folder of a trained run"""
     envmap: Annotated[tuple[Path, ...], written("MAP [MAP ...]", "none")] = ()
-    """equirectangular maps, twice as wide as high, .exr or .hdr, linear radiance"""
+    """equirectangular environment maps, .exr or .hdr, in linear radiance"""
     out: Annotated[Path | None, written("DIR", "in RUN/relight")] = None
-    """folder for the pictures, with a folder for each map where there are several"""
+    """folder to write to, with a subfolder for each map if there are several"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RelightOptions:
-    """How relit pictures are made.
+    """How images are relit.
 
     Raises:
         UserError: a number is out of range.
@@ -49,35 +49,34 @@ class RelightOptions:
         tuple[tuple[float, ...], ...],
         written("AZIMUTH ELEVATION IRRADIANCE [ANGLE]", name="sun", repeatable=True),
     ] = ()
-    """a far light: degrees from +X counter-clockwise and above the horizon, irradiance, degrees
-    across (0.53 if not given; 0: hard shadows); repeatable"""
+    """distant light; angles in degrees, ANGLE is its diameter (0.53); repeatable"""
     point_lights: Annotated[
         tuple[tuple[float, float, float, float], ...],
         written("X Y Z INTENSITY", name="point", repeatable=True),
     ] = ()
-    """a near light: where it stands, irradiance at distance 1; repeatable"""
+    """point light at X Y Z; INTENSITY is its irradiance at distance 1; repeatable"""
     cameras: Annotated[str, written("test|orbit|FILE")] = "test"
-    """the test views, an orbit around the object, or a path in a transforms.json"""
+    """test views, an orbit around the object, or a path from a transforms.json"""
     ground: Annotated[str | None, written("lowest|HEIGHT")] = None
-    """z of a floor that catches the object's shadow, or lowest for its lowest point"""
-    elevation: Annotated[float, written("DEGREES")] = ELEVATION
-    """of an orbit above the horizon, degrees"""
-    turn: Annotated[int | None, written("FRAMES")] = None
-    """frames of a turn of the light under the first camera"""
+    """add a floor that receives shadows: its height, or the object's lowest point"""
+    elevation: Annotated[float, written("DEGREES", advanced=True)] = ELEVATION
+    """elevation of an orbit above the horizon"""
+    turn: Annotated[int | None, written("FRAMES", advanced=True)] = None
+    """keep the first camera and turn the light once in this number of frames"""
     resolution: Annotated[int | None, written("PIXELS", "the data's; orbits: 512")] = None
-    """width of the pictures"""
-    rotate: Annotated[float, written("DEGREES")] = 0.0
-    """turn maps and suns counter-clockwise about +Z, degrees"""
-    exposure: Annotated[float, written("FACTOR")] = 1.0
-    """factor on all light"""
+    """width of the images"""
+    rotate: Annotated[float, written("DEGREES", advanced=True)] = 0.0
+    """turn maps and suns counter-clockwise about +Z"""
+    exposure: Annotated[float, written("FACTOR", advanced=True)] = 1.0
+    """multiply all light by this factor"""
     samples: int = SAMPLES
-    """of the light, per pixel"""
-    noise: Annotated[float | None, written("SHARE")] = None
-    """instead of --samples: as many as bring the relative noise below this, such as 0.02"""
-    bounces: int = BOUNCES
-    """reflections between parts of the object"""
+    """light samples per pixel"""
+    noise: Annotated[float | None, written("SHARE", advanced=True)] = None
+    """in place of --samples: add samples until the relative noise is below SHARE"""
+    bounces: Annotated[int, ADVANCED] = BOUNCES
+    """light bounces between parts of the object"""
     background: Background = "transparent"
-    """what stands behind the object"""
+    """background of the images"""
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.rotate):
@@ -125,16 +124,16 @@ class RelightOptions:
 @dataclass(frozen=True, kw_only=True)
 class Relight(RelightOptions, Where):  # whose fields come first
     orbit: Annotated[int | None, written("FRAMES")] = None
-    """frames of an orbit; --cameras "orbit FRAMES" is the same"""
+    """orbit around the object in this number of frames"""
     animation: Annotated[tuple[Animation, ...], written(default="none")] = ()
-    """the frames as a moving picture too"""
+    """also write the frames as an animation"""
     resume: bool = False
-    """keep the frames that are there"""
+    """keep frames that exist already"""
 
 
 @takes(Relight)
 def command(asked: Relight) -> Path:
-    """Render a run under other light: environment maps, suns, points."""
+    """Render a run under environment maps, suns and point lights."""
     run, envmap, out = Path(asked.run), asked.envmap, asked.out
     options = {field.name: getattr(asked, field.name) for field in fields(RelightOptions)}
     if asked.orbit is not None:
@@ -235,7 +234,7 @@ def relight_to_files(
     paths = [Path(path) for path in envmap] if several else [Path(envmap)]
     if len({path.stem for path in paths}) != len(paths):
         raise UserError(
-            "relight: expected environment maps of different names, got "
+            "relight: expected environment maps with different names, got "
             f"{[str(path) for path in paths]}"
         )
     for kind in animation:
@@ -279,11 +278,11 @@ def relight_images(
 
     Args:
         run: folder of the trained scene.
-        envmap: a file, a map, or None for the suns and point lights alone.
+        envmap: a file, a map, or None for the suns and point lights only.
         cameras, options: fields of `RelightOptions`.
 
     Raises:
-        UserError: as of `relight_to_files`.
+        UserError: as in `relight_to_files`.
     """
     from univoxel.camera import stacked
     from univoxel.output.viewpoints import frames_of, pictures_of

@@ -1,4 +1,4 @@
-"""A trained run as a report: how good it is, where it is in doubt, what to photograph next."""
+"""Report on a trained run: its quality, its uncertainty, and what to photograph next."""
 
 from __future__ import annotations
 
@@ -16,27 +16,29 @@ class ReportOptions:
     run: Run
     """folder of a trained run"""
     html: Annotated[Path | None, written("FILE.html", "RUN/report.html")] = None
-    """the page to write, which needs no network"""
+    """page to write; it works offline"""
     data: DataOf = None
-    """folder of the photographs, where they were moved"""
+    """folder of the photographs, if they were moved"""
     views: Annotated[int, written("N")] = 4
-    """photographs beside their render, the worst first"""
+    """number of photographs to compare with their render, worst first"""
     title: Title = None
-    """what stands above it"""
+    """heading of the page"""
 
 
 @takes(ReportOptions)
 def command(asked: ReportOptions) -> Path:
-    """Say how good a run is, and what to photograph next, on one web page.
+    """Report how good a run is and what to photograph next.
 
-    Photographs beside their render, doubt painted on the object, materials, light, the course of
-    training, and directions from which more photographs would help. It needs no truth.
+    The web page shows photographs beside their render, uncertainty on the surface, materials,
+    light, the progress of training, and directions from which more photographs would help. It needs
+    no ground truth.
     """
     return report(**vars(asked))
 
 
 def report(run: File, html: File | None = None, **options: Any) -> Path:
-    """Write the report of a run; arguments and errors as of `univoxel.output.report.write_report`.
+    """Write the report of a run; arguments and errors are those of
+    `univoxel.output.report.write_report`.
 
     Args:
         html: the page; in the run's folder when left out.

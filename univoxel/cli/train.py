@@ -21,63 +21,46 @@ OWN = ("data", "out", "config", "minutes", "downscale", "allow_outside", "seed",
 
 @dataclass(frozen=True, kw_only=True)
 class TrainOptions:
-    """What is trained, and how; `univoxel.train` takes them too."""
+    """Options of a training; `univoxel.train` has them too."""
 
     data: Annotated[parsing.File, parsing.written("DATA", positional=True)]
-    """folder of the photographs and their cameras"""
+    """folder with the photographs and their cameras"""
     out: Annotated[parsing.File, parsing.written("RUN")]
-    """folder that the run is written to"""
+    """folder to write the run to"""
     preset: choices.PresetOrAuto = "auto"
-    """how much work goes in: draft is a look, 1 minute on two cores, fast the usual, 2, full finer,
-    5, best the finest, 8; auto is what fits into --minutes, or else fast"""
-    light: choices.LightName = "hybrid"
-    """sg, local lobes as published; hybrid, then one environment map with traced visibility, which
-    cleans shadows from the albedo; others to compare with: sh and mlp, local too, envmap-sg and
-    envmap, one map from the beginning, and baked, none: the photographs' colours are taken for
-    albedo, as a photogrammetry mesh has them"""
-    varying: choices.Differing = "auto"
-    """what differs from photograph to photograph: exposure, with the colour balance, or the light
-    itself too; auto is exposure where it is seen to differ, else none"""
-    light_frame: choices.LightFrameOrAuto = "auto"
-    """world, where the light stood still; turntable, where it turned with the camera; camera, where
-    a flash at the lens lit the object; auto is what explains the photographs best"""
-    metal: choices.Metal = "auto"
-    """all, if the whole object is metal, patina included; some, if not; auto decides it"""
+    """amount of work, from draft to best; auto: what fits --minutes, else fast"""
+    light: Annotated[choices.LightName, parsing.ADVANCED] = "hybrid"
+    """lighting model; hybrid separates shadows best, the others are for comparison"""
+    varying: Annotated[choices.Differing, parsing.ADVANCED] = "auto"
+    """what changes between photographs; auto: exposure, if it is seen to change"""
+    light_frame: Annotated[choices.LightFrameOrAuto, parsing.ADVANCED] = "auto"
+    """world: the light stood still; turntable: moved with the camera; camera: a flash"""
+    metal: Annotated[choices.Metal, parsing.ADVANCED] = "auto"
+    """all: the object is entirely metal, with patina; some: it is not; auto: detect"""
     detail: choices.DetailingOrAuto = "auto"
-    """texture takes the albedo from the photographs at their own size, once the rest is trained,
-    where they show more than the grid holds; none leaves it to the grid; auto is texture, but none
-    for draft and for the light baked"""
+    """texture: refine the albedo from full-size photographs; auto: except for draft"""
     masks: choices.MasksFrom = "auto"
-    """auto takes masks in that end outside of the object, as the photographs show it"""
+    """auto: erode masks that extend past the object's edge; given: leave unchanged"""
     cameras: choices.CamerasFrom = "auto"
-    """refined puts the photographs' cameras right, before training and in it; auto does so where
-    their silhouettes contradict one another"""
-    field: choices.FieldName = "hash"
-    """hash takes features from a small table of many resolutions; dense stores them at every node
-    of the grid, sparse in bricks around the surface alone, for finer grids than the presets', such
-    as --set stages.1.voxels=30"""
-    capacity: choices.CapacityOrAuto = "auto"
-    """adaptive makes no larger a model than the scene needs, as held-out pixels tell: fewer rows of
-    features, fewer levels of mirrored directions, fewer nodes far from the surface. auto is that,
-    but fixed for sparse fields and for lights other than hybrid"""
-    budget_mb: Annotated[float | None, parsing.written("MB", "no limit")] = None
-    """most megabytes of the model's file; implies --capacity adaptive"""
+    """refined: optimise camera poses; auto: only if silhouettes are inconsistent"""
+    field: Annotated[choices.FieldName, parsing.ADVANCED] = "hash"
+    """storage of features: a hash table, every grid node, or bricks at the surface"""
+    capacity: Annotated[choices.CapacityOrAuto, parsing.ADVANCED] = "auto"
+    """adaptive: shrink the model as validation allows; auto: if field and light can"""
+    budget_mb: Annotated[float | None, parsing.written("MB", "no limit", advanced=True)] = None
+    """maximum size of the model file in megabytes; implies --capacity adaptive"""
     config: parsing.ConfigFile = None
-    """config.json of another run, to train these photographs alike: it says all that --preset,
-    --light and such would; --minutes, --seed, --downscale and --set go before it"""
+    """reuse the config.json of another run in place of --preset, --light and others"""
     minutes: parsing.Minutes = None
-    """wall-clock limit, above 0, from the first photograph read to the end: what does not fit is
-    cut, in all stages alike; without, all steps are made, however long they take"""
+    """time limit, including preparation; every stage is shortened alike to fit"""
     downscale: parsing.DownscaleBy = "auto"
-    """train on photographs of 1/N of their width and height; auto is as large as leaves what grids
-    can use, 1 below 1500 pixels"""
-    allow_outside: bool = False
-    """read photographs outside of DATA too, where its files or links name such"""
-    seed: Annotated[int | None, parsing.written("N", "0, or that of --config")] = None
-    """of all random choices"""
+    """train at 1/N of the photographs' size; auto: no more pixels than grids can use"""
+    allow_outside: Annotated[bool, parsing.ADVANCED] = False
+    """also read files outside the folder if the data set refers to them"""
+    seed: Annotated[int | None, parsing.written("N", "0, or from --config", advanced=True)] = None
+    """random seed"""
     changes: parsing.Changes = ()
-    """for experts: one field of the configuration, such as loss.radiance=0.5 or stages.1.voxels=3;
-    config.json in a run's folder holds them all"""
+    """change one configuration field, such as loss.radiance=0.5; repeatable"""
 
     def configuration(self) -> TrainConfig:
         """What they amount to.
@@ -118,7 +101,7 @@ class TrainOptions:
 
         for field in fields(TrainOptions):
             if field.name not in OWN and (value := getattr(self, field.name)) != field.default:
-                both = f"expected config or {field.name}={value}, got both: {file} says it"
+                both = f"expected config or {field.name}={value}, got both: {file} sets it"
                 raise UserError(both, "config", field.name)
         config = replace(load_config(file), data=Path(self.data), out=Path(self.out))
         return config if self.minutes is None else replace(config, minutes=self.minutes)
@@ -127,32 +110,34 @@ class TrainOptions:
 @dataclass(frozen=True, kw_only=True)
 class Train(TrainOptions):
     resume: bool = False
-    """go on with the run in --out; where nothing was saved yet, it begins"""
-    timelapse: Annotated[str | None, parsing.written("FILE.gif|FILE.mp4|DIR/", "none")] = None
-    """picture of a test view over training time, or a folder of its frames"""
+    """resume the run in --out, or start it if nothing was saved yet"""
+    timelapse: Annotated[
+        str | None, parsing.written("FILE.gif|FILE.mp4|DIR/", "none", advanced=True)
+    ] = None
+    """record a test view during training, as an animation or a folder of frames"""
     view: bool = False
-    """look at the training in a browser while it goes, and end it early"""
-    host: Annotated[str | None, parsing.written("ADDRESS", "127.0.0.1")] = None
-    """address that --view listens on"""
-    port: Annotated[int | None, parsing.written("N", "8080")] = None
-    """port that --view listens on"""
-    no_page: bool = False
-    """write no RUN/index.html at the end"""
+    """watch the training in a browser; you can end it early there"""
+    host: Annotated[str | None, parsing.written("ADDRESS", "127.0.0.1", advanced=True)] = None
+    """address for --view to listen on"""
+    port: Annotated[int | None, parsing.written("N", "8080", advanced=True)] = None
+    """port for --view to listen on"""
+    no_page: Annotated[bool, parsing.ADVANCED] = False
+    """do not write RUN/index.html"""
 
     def view_at(self) -> tuple[str, int] | None:
-        """Host and port that a training is looked at, if at all; a UserError for one alone."""
+        """Host and port for watching the training, or None; a UserError without --view."""
         host, port = self.host, self.port
         if self.view:
             return "127.0.0.1" if host is None else host, 8080 if port is None else port
         if host is not None or port is not None:
             option = f"--host {host}" if host is not None else f"--port {port}"
-            raise UserError(f"expected --view with {option}, got that alone")
+            raise UserError(f"{option} needs --view")
         return None
 
 
 @parsing.takes(Train)
 def command(asked: Train) -> int:
-    """Recover geometry, materials and light from posed photographs."""
+    """Recover shape, materials and light from posed photographs."""
     from univoxel.cli.trainer import train
 
     watched = {"timelapse": asked.timelapse, "view": asked.view_at()}
@@ -166,7 +151,7 @@ def command(asked: Train) -> int:
 
 
 def code_of(run: Path) -> int:
-    """The exit code of a training: 3 where a stage made no step at all, or else 0."""
+    """The exit code of a training: 3 if a stage made no step at all, else 0."""
     from univoxel.run import load_verdict
 
     verdict = load_verdict(run)

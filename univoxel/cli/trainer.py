@@ -1,4 +1,4 @@
-"""Photographs in, a scene out: what training does, in order."""
+"""The steps of a training, from photographs to a scene."""
 
 from __future__ import annotations
 
@@ -59,12 +59,12 @@ def train(
     on_progress: Callable[[TrainingProgress], None] | None = None,
     view: tuple[str, int] | None = None,
 ) -> Path:
-    """Train a scene; leave model, log, preview, configuration, verdict.json and trust.txt in
+    """Train a scene; write model, log, preview, configuration, verdict.json and trust.txt to
     cfg.out; return it.
 
     Args:
-        resume, timelapse, on_progress, view: as of `univoxel.train`. Where there is no checkpoint
-            to resume from, training begins; making pictures does not count as time.
+        resume, timelapse, on_progress, view: as in `univoxel.train`. If there is no checkpoint to
+            resume from, training starts; recording images does not count as time.
 
     Raises:
         MissingExtra: view without viser.
@@ -84,7 +84,7 @@ def train(
     from univoxel.viewer.training import watched
 
     with watched(*view, cfg.out.resolve().name) as spectators, memmap.large_arrays_in(cfg.out):
-        log.info(f"to look at while it trains, in a browser: {spectators.address}")
+        log.info(f"Watch the training in a browser: {spectators.address}")
         return _train(cfg, resume, film, spectators, on_progress)
 
 
@@ -100,7 +100,7 @@ def _train(
     torch.manual_seed(cfg.seed)
     if not resume and (cfg.out / FILE).exists():
         raise ExistingFile(
-            f"{cfg.out} holds a run already: pass resume or another out", "resume", "out"
+            f"{cfg.out} holds a run already: pass resume, or choose another out", "resume", "out"
         )
     kept, outside = kept_photos(cfg.out, "train"), cfg.allow_outside
     photos = load_photos(cfg.data, "train", cfg.downscale, kept=kept, allow_outside=outside)
@@ -111,7 +111,7 @@ def _train(
     check_memory(photos, cfg)
     begun = resumed(cfg) if resume else None
     state = begun[1] if begun else {}
-    (cfg.out / VERDICT).unlink(missing_ok=True)  # of a run that goes on
+    (cfg.out / VERDICT).unlink(missing_ok=True)  # of a run that continues
     shutil.rmtree(cfg.out / "detail", ignore_errors=True)  # as well
 
     begin -= state.get("seconds", 0.0)
@@ -150,7 +150,9 @@ def _train(
     )
     made_after_training(scene, pixels.photos, cfg.out, cfg.detail, until)
     for choice in progress.chosen:
-        log.info(choice.sentence)
+        log.debug(choice.sentence)
+    for line in verdict.lines():
+        log.info(line)
     return cfg.out
 
 
@@ -222,13 +224,13 @@ def build_field(prepared: Prepared, cfg: config.TrainConfig) -> Field:
 
 
 def resumed(cfg: config.TrainConfig) -> tuple[Scene, dict[str, Any]] | None:
-    """The scene that a run goes on with, and its state; None where nothing was saved yet.
+    """The scene that a run continues with, and its state; None if nothing was saved yet.
 
     Raises:
         UserError: the checkpoint cannot be read, or it belongs to another configuration.
     """
     if not (cfg.out / FILE).is_file():
-        log.info(f"nothing was saved in {cfg.out} yet: training begins")
+        log.info(f"{cfg.out}: nothing was saved yet, so the training starts from the beginning")
         return None
     scene, state = load_checkpoint(cfg.out)
     config.check_same(cfg)
@@ -236,7 +238,7 @@ def resumed(cfg: config.TrainConfig) -> tuple[Scene, dict[str, Any]] | None:
 
 
 def announce(progress: Progress, photos: Photos) -> None:
-    """Say how long all will take on this machine, and what a limit leaves out."""
+    """Log the expected time on this machine, and what a time limit leaves out."""
     clock, cfg = progress.clock, progress.cfg
     pixels = len(photos) * photos.cameras.width * photos.cameras.height / 1e6
     before = clock.seconds + PREPARATION_SECONDS * progress.slower * pixels
@@ -248,20 +250,20 @@ def announce(progress: Progress, photos: Photos) -> None:
         log.info(f"{what}: about {duration(whole)} on this machine")
         return
     fits = max(clock.limit - clock.preparation - RESERVE_SECONDS, 0.0) / clock.planned
-    said = f"{what}: about {duration(whole)} on this machine; minutes={cfg.minutes:g} are enough "
+    said = f"{what}: about {duration(whole)} on this machine; minutes={cfg.minutes:g} is enough "
     if fits < 1:
         said += f"for about {fits:.0%} of the steps"
     else:
         said += f"for all steps if cameras and masks take {duration(clock.preparation)}"
     if fits < LEAST:
-        said += f", minutes={math.ceil(whole / 60)} for all of them"
+        said += f"; minutes={math.ceil(whole / 60)} is enough for all of them"
     log.info(said, extra={"arguments": ("minutes",)})
 
 
 def evidence(
     scene: Scene, pixels: TrainingPixels, progress: Progress, surveyed: Survey | None
 ) -> Evidence:
-    """What the verdict on a training rests on."""
+    """The evidence for the verdict on a training."""
     clock, held_out = progress.clock, pixels.held_out
     batch = batch_at(scene.registered(pixels.photos), held_out)
     with torch.no_grad():
@@ -343,20 +345,20 @@ def bring_to_grid_(
 
 
 def trusted(scene: Scene, photos: Photos) -> Survey | None:
-    """What the photographs leave open; None where there is no surface that they show."""
+    """What the photographs leave open; None if there is no surface that they show."""
     try:
         return survey(scene, photos, REPORT_POINTS)
     except UserError as error:
-        log.info(f"no trust report: {error}")
+        log.info(f"no uncertainty report: {error}")
         return None
 
 
 def save_trust(
     verdict: Verdict, surveyed: Survey | None, troubles: list[str], cfg: config.TrainConfig
 ) -> None:
-    """Write to the run's trust.txt, and log, how it came out and what photographs leave open."""
+    """Write the verdict and the uncertainty to the run's trust.txt."""
     text = verdict.sentence() + "."
     if surveyed is not None:
-        text += " " + words(numbers(surveyed), troubles)
+        log.debug(uncertain := words(numbers(surveyed), troubles))
+        text += " " + uncertain
     write_text(cfg.out / "trust.txt", text + "\n")
-    log.info(text)

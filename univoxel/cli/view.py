@@ -1,4 +1,4 @@
-"""A trained scene to look at and to light: in a browser, live, or as one web page."""
+"""View and relight a trained scene in a browser: live, or as a web page."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ class ViewOptions:
     run: Run
     """folder of a trained run"""
     html: Annotated[File | None, written("FILE.html", "a server")] = None
-    """write this page, which needs no network, instead of serving"""
-    envmap: Annotated[tuple[File, ...], written("MAP [MAP ...]", "the usual ones alone")] = ()
-    """equirectangular maps to offer, before the usual ones"""
+    """write a page that works offline, and do not start the server"""
+    envmap: Annotated[tuple[File, ...], written("MAP [MAP ...]", "the built-in maps")] = ()
+    """additional environment maps to offer"""
     title: Title = None
-    """what stands above the object"""
+    """heading of the page"""
     host: Annotated[str, written("ADDRESS")] = "127.0.0.1"
-    """address to listen on; the default is reached from this machine alone"""
+    """address to listen on; 127.0.0.1 accepts only this machine"""
     port: Annotated[int, written("N")] = 8080
-    """port to listen on; 0 is any free one"""
+    """port to listen on; 0: any free port"""
 
 
 @takes(ViewOptions)
 def command(asked: ViewOptions) -> Path | None:
-    """Look at a run in a browser and turn its light; or write it as one web page to send.
+    """View and relight a run in a browser, or write a web page.
 
     Returns:
-        The page, written whole or not at all; None of a server, after it has ended.
+        The page, which is written atomically; None after a server has ended.
 
     Raises:
-        UserError: the run or a map cannot be used, there is no surface, or the port is taken.
-        MissingExtra: viser is missing, which the server needs.
+        UserError: the run or a map cannot be used, there is no surface, or the port is in use.
+        MissingExtra: the server needs viser, which is not installed.
         OSError: a file cannot be read or written.
     """
     from univoxel.detail.texture import page_options
@@ -53,16 +53,16 @@ def command(asked: ViewOptions) -> Path | None:
 
     page = PageOptions(asked.title, asked.envmap, **page_options(asked.run))
     with serving(subject_of(Path(asked.run)), page, asked.host, asked.port) as address:
-        log.info(f"to look at, in a browser: {address} (Ctrl-C ends it)")
+        log.info(f"Open {address} in a browser (Ctrl-C stops the server)")
         try:
             threading.Event().wait()
         except KeyboardInterrupt:
-            log.info("ended")
+            log.info("stopped")
     return None
 
 
 def with_page(run: Path) -> Path:
-    """Write the page of a run into its folder and name it; say so where it cannot be done.
+    """Write the page of a run into its folder and log its path, or log why that failed.
 
     Returns:
         The run.
@@ -72,7 +72,8 @@ def with_page(run: Path) -> Path:
 
     try:
         page = write_page(run, run / PAGE, **page_options(run))
-        log.info(f"to look at, in a browser: {page}")
+        log.info(f"Page: open {page} in a browser")
+        log.info(f"Next: univoxel view {run}, or univoxel export {run} --mesh FILE.glb")
     except (UserError, OSError) as error:  # the training is done and saved
-        log.warning(f"no page was written: {error}")
+        log.warning(f"the web page was not written: {error}")
     return run

@@ -1,4 +1,4 @@
-"""What everything stands on: errors, files, records of tensors, checks, the machine."""
+"""Shared foundations: errors, files, records of tensors, checks, the machine."""
 
 import logging
 

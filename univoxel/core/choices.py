@@ -1,4 +1,4 @@
-"""Words and defaults that configuration, package and command line share. Imports no torch."""
+"""Choices and defaults shared by configuration, package and command line. Imports no torch."""
 
 from __future__ import annotations
 

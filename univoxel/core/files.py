@@ -1,5 +1,4 @@
-"""Files that appear whole or not at all, JSON in files, and which steps of a task are done in a
-folder."""
+"""Atomic file writing, JSON files, and records of finished steps in a folder."""
 
 from __future__ import annotations
 
@@ -85,14 +84,14 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_bytes().decode("utf-8-sig"))
     except json.JSONDecodeError as error:
         raise DataError(
-            f"{path}: broken JSON in line {error.lineno}, column {error.colno}: {error.msg}"
+            f"{path}: invalid JSON in line {error.lineno}, column {error.colno}: {error.msg}"
         ) from None
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: expected text in UTF-8, got {error.reason}") from None
     except RecursionError:
-        raise DataError(f"{path}: expected JSON, got lists or objects nested too deep") from None
+        raise DataError(f"{path}: expected JSON, got too deep a nesting") from None
     except ValueError:  # Python converts no integers of more than 4300 digits
-        raise DataError(f"{path}: expected JSON, got an integer of too many digits") from None
+        raise DataError(f"{path}: expected JSON, but an integer has too many digits") from None
 
 
 # Which steps of a task are done in a folder, and with what: one file, beside what they made.
@@ -105,7 +104,7 @@ FILE = "steps.json"
 
 
 def finish(folder: Path, step: str, fingerprint: Any) -> None:
-    """Note that a step is done; the folder is made where there is none."""
+    """Note that a step is done; the folder is made if there is none."""
     _write(folder, _read(folder) | {step: fingerprint})
 
 
@@ -135,7 +134,7 @@ def done(
         return before is not None
     if refusal is not None:
         raise refusal(before)
-    raise ExistingFile(f"{folder}: {step} has other options: choose another out", "out")
+    raise ExistingFile(f"{folder}: {step} was made with other options: choose another out", "out")
 
 
 def as_json(fingerprint: Any) -> Any:

@@ -1,6 +1,6 @@
-"""Processes of Python that end with the one that began them, and run its package.
+"""Child processes of Python that run the package and end with their parent.
 
-A process that is killed cannot end those that it began. They would go on alone, and write into
+A process that is killed cannot end those that it began. They would continue alone, and write into
 files beside those that are begun again.
 
 Python looks for modules in the working folder first, which may be anybody's: a folder of
@@ -68,7 +68,7 @@ def guarded(
     """A process of `command`, which ends with the block at the latest.
 
     Args:
-        arguments: as of `command`.
+        arguments: as in `command`.
         output: takes all that it says.
         options: more of Popen's.
     """

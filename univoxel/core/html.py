@@ -1,4 +1,4 @@
-"""HTML of pages that need no other file and no network: text, tables, pictures and curves."""
+"""HTML of self-contained pages: text, tables, images and curves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The machine that a program runs on: processor, cores, memory. None where it does not say."""
+"""The machine: processor, cores, memory. None if the system does not tell."""
 
 from __future__ import annotations
 

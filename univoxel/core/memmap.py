@@ -1,5 +1,4 @@
-"""Arrays of many photographs, in files where they are too large for memory, and work on them
-side by side."""
+"""Large arrays of photographs, in files if memory is too small, and parallel work on them."""
 
 from __future__ import annotations
 
@@ -67,13 +66,13 @@ def reserve(descriptor: int, size: int, place: Path) -> None:
     """Make an open file as long, on the disk too: where that is full later, the process would end.
 
     Args:
-        place: that an OSError names where there is no room.
+        place: that an OSError names if there is no room.
     """
     try:
         system.reserve(descriptor, size)
     except OSError as error:
         raise OSError(
-            error.errno, f"no room for {size / 1e9:.1f} GB: {error.strerror}", str(place)
+            error.errno, f"no space left for {size / 1e9:.1f} GB: {error.strerror}", str(place)
         ) from error
 
 
@@ -88,7 +87,7 @@ def mapped(path: Path, offset: int, shape: Sequence[int], dtype: torch.dtype) ->
         OSError: the file cannot be written.
     """
     if offset % dtype.itemsize:
-        raise ValueError(f"{path}: numbers at {offset} are not aligned")
+        raise ValueError(f"{path}: the numbers at offset {offset} are not aligned")
     end = offset + math.prod(shape) * dtype.itemsize
     if (size := path.stat().st_size) < end:  # it would be made longer, with zeros
         raise ValueError(f"{path}: expected {end} bytes, got {size}")

@@ -1,4 +1,4 @@
-"""Progress for who asked for it: whose logger `univoxel` is enabled for INFO.
+"""Progress bars, shown if the logger `univoxel` is enabled for INFO.
 
 A bar on stderr where that is a terminal; elsewhere a line of the log now and then.
 """
@@ -19,7 +19,7 @@ from univoxel.core import log
 
 T = TypeVar("T")
 
-LINE_SECONDS = 10.0  # between lines, where there is no bar
+LINE_SECONDS = 10.0  # between lines, if there is no bar
 
 
 class _Lines(Progress):

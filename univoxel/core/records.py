@@ -1,4 +1,4 @@
-"""What one stage of the pipeline hands to the next: frozen records of tensors.
+"""Frozen records of tensors that stages of the pipeline pass on.
 
 Sizes: N rays, M samples, C features, V views, P points.
 """

@@ -1,4 +1,4 @@
-"""What Linux, macOS and Windows each do in another way: files, processes, what a machine has.
+"""Differences between Linux, macOS and Windows: files, processes, resources of the machine.
 
 Nothing else of the package asks which system it runs on. Where Linux says more, in its own files,
 `machine` reads that first.
@@ -66,7 +66,7 @@ def flush(path: Path) -> None:
 
 
 def reserve(descriptor: int, size: int) -> None:
-    """Make an empty open file as long, on the disk too; an OSError where there is no room."""
+    """Make an empty open file as long, on the disk too; an OSError if there is no room."""
     if sys.platform == LINUX:
         os.posix_fallocate(descriptor, 0, size)
         return
@@ -119,7 +119,7 @@ def can_be_a_name(name: str) -> bool:
 
 PR_SET_PDEATHSIG = 1  # of <sys/prctl.h>; it stays through exec
 WATCHED_EVERY = 0.5  # seconds
-CREATE_NEW_PROCESS_GROUP = 0x200  # of Windows, as subprocess has it there alone
+CREATE_NEW_PROCESS_GROUP = 0x200  # of Windows, as subprocess has it there only
 FAULT = 0xC0000000  # exit codes of Windows from which on the system ended a process
 FAULTS = {0xC0000005: "an access violation", 0xC0000017: "a lack of memory"}
 

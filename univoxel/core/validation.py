@@ -1,5 +1,4 @@
-"""Checks of what configurations hold, fields that files of earlier versions hold still, and
-fields changed by their path."""
+"""Checks of configurations, fields in files of earlier versions, and changes of fields by path."""
 
 from __future__ import annotations
 
@@ -54,7 +53,7 @@ def without_retired(kind: Any, values: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if name not in gone}
 
 
-# Meaning, unit and range of a field stand in its metadata, once: checks and the reference page are
+# Meaning, unit and range of a field are in its metadata, once: checks and the reference page are
 # derived from there.
 
 

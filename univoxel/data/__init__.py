@@ -50,21 +50,20 @@ def load_photos(
     kept: Path | None = None,
     allow_outside: bool = False,
 ) -> Photos:
-    """Read the photographs of one split in whatever layout the folder has.
+    """Read the photographs of one split; the layout of the folder is detected.
 
-    Lens distortion is taken out. docs/reference/data-sets.md shows the layouts.
+    Lens distortion is removed. docs/reference/data-sets.md describes the layouts.
 
     Args:
-        downscale: side of the squares of pixels that become one, >= 1; 0: as large as leaves what
-            grids can use, 1 for photographs of 1499 pixels and fewer.
-        masks: False for photographs as they are, the whole picture opaque; or a folder of masks of
-            them, named by their stems.
-        kept: a file of `keep_photos`, there or not. Where it has these photographs, as their files
-            are now, the pixels come from it.
-        allow_outside: whether what the folder's files and links name may lie outside of it.
+        downscale: reduce photographs to 1/N, >= 1; 0: to what grids can use, 1 for photographs of
+            up to 1499 pixels.
+        masks: False: whole images, without masks; or a folder of masks with the same stems.
+        kept: a file of `keep_photos`, which may not exist yet. If it has these photographs and
+            their files are unchanged, the pixels are read from it.
+        allow_outside: whether files and links may lead outside the folder.
 
     Raises:
-        DataError: one line that names the file, what was expected and what came.
+        DataError: one line that names the file, and what was expected and found.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -77,11 +76,12 @@ def load_photos(
     files = sorted(path.name for path in folder.iterdir())
     raise DataError(
         f"{folder}: expected photographs with their cameras, got "
-        f"{some(files) or 'an empty folder'} (looked for "
-        f"transforms_{split}.json, transforms.json, cameras and images (.bin or .txt) of COLMAP in "
-        f"sparse/0, sparse, colmap/sparse/0 and here, poses_bounds.npy, cameras_sphere.npz, "
-        f"inputs/sfm_scene.json, keyframes/corrected_cameras, XML of Metashape, CSV of "
-        f"RealityCapture, {split}_000/metadata.json)"
+        f"{some(files) or 'an empty folder'}. If these are photographs without cameras, run "
+        f"`univoxel capture {folder} --out DIR` (looked for transforms_{split}.json, "
+        "transforms.json, a COLMAP model (cameras and images, .bin or .txt) in sparse/0, "
+        "sparse, colmap/sparse/0 or here, poses_bounds.npy, cameras_sphere.npz, "
+        "inputs/sfm_scene.json, keyframes/corrected_cameras, Metashape XML, RealityCapture CSV, "
+        f"{split}_000/metadata.json)"
     )
 
 

@@ -43,7 +43,7 @@ class Registered:
 
     camera: int
     name: str  # path within the folder of photographs
-    pose: np.ndarray  # [3, 4] camera-to-world, axes as of `Cameras`
+    pose: np.ndarray  # [3, 4] camera-to-world, axes as in `Cameras`
 
 
 def is_colmap(folder: Path, split: str) -> bool:
@@ -74,13 +74,13 @@ def list_colmap(folder: Path, split: str) -> Listed:
     for image in images:  # all of them, before a picture is opened
         if image.name in names or not image.name or "\0" in image.name:
             raise DataError(
-                f"{images_file}: expected names of photographs, each once, got {image.name!r}"
+                f"{images_file}: expected photographs with unique names, got {image.name!r}"
             )
         names.add(image.name)
     shots, missing, scaled = [], [], 0
     for image in images:
         if image.camera not in cameras:
-            raise DataError(f"{images_file}: {image.name} has camera {image.camera}, got no such")
+            raise DataError(f"{images_file}: {image.name} has no camera {image.camera}")
         path = find_photo(folder, image.name, str(images_file))
         if path is None:
             missing.append(image.name)
@@ -91,15 +91,15 @@ def list_colmap(folder: Path, split: str) -> Listed:
             lens, scaled = fitted(lens, path, cameras_file.name), scaled + 1
         elif (width, height) != (lens.width, lens.height):
             raise DataError(
-                f"{path}: expected {lens.width}x{lens.height} pixels as its camera has in "
-                f"{cameras_file.name}, got {width}x{height}{turn_note(path)}"
+                f"{path}: expected {lens.width}x{lens.height} pixels, as its camera in "
+                f"{cameras_file.name} has, got {width}x{height}{turn_note(path)}"
             )
         inner = PurePosixPath(image.name.replace("\\", "/"))
         name = inner.with_suffix("").as_posix().replace("/", "_")
         shots.append(Shot(name, str(images_file), path, None, image.pose, lens))
     note = f" (looked in {folder / 'images'} and {folder})"
     lost = left_out(str(images_file), missing, len(images), note)
-    lost += [f"cameras of {scaled} scaled to smaller pictures"] if scaled else []
+    lost += [f"cameras of {scaled} scaled to smaller images"] if scaled else []
     if len(models) > 1:
         lost = [f"{model.relative_to(folder)}, the largest of {len(models)} models", *lost]
     return turned_up(folder, split, "COLMAP model", shots, lost, listed_split)
@@ -174,7 +174,7 @@ def _models(folder: Path) -> list[tuple[Path, str]]:
 
 
 def _ending(model: Path) -> str | None:
-    """The ending of a model's files; None where there is no model."""
+    """The ending of a model's files; None if there is no model."""
     for ending in (".bin", ".txt"):
         if all((model / f"{name}{ending}").is_file() for name in ("cameras", "images")):
             return ending
@@ -190,7 +190,7 @@ def _count(images: Path) -> int:
 
 
 def _broken(path: Path, error: Exception) -> DataError:
-    return DataError(f"{path}: expected a file of a COLMAP model, could not read it: {error}")
+    return DataError(f"{path}: this file of a COLMAP model could not be read: {error}")
 
 
 def _parameters(path: Path, number: int, model: str) -> int:
@@ -261,5 +261,5 @@ def image_records(data: bytes) -> Iterator[tuple[int, list[float], int, str, np.
         (features,) = struct.unpack_from("<Q", data, end + 1)
         at = end + 9 + features * SEEN.itemsize
         if at > len(data):
-            raise ValueError("the file is cut off")
+            raise ValueError("the file is truncated")
         yield number, pose, camera, name, np.frombuffer(data, SEEN, features, end + 9)

@@ -1,4 +1,4 @@
-"""What the layouts of other programs share: axes, names, numbers."""
+"""Conventions that layouts of other programs share: axes, names, numbers."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def turned_up(
 
 
 def listed_split(folder: Path, shots: Sequence[Shot], split: str) -> list[Shot]:
-    """The split of train_id.txt and test_id.txt, as of Stanford-ORB; without, every eighth."""
+    """The split of train_id.txt and test_id.txt, as in Stanford-ORB; without, every eighth."""
     files = {name: folder / f"{name}_id.txt" for name in ("train", "test")}
     if split not in files or not all(file.is_file() for file in files.values()):
         return every_eighth(folder, shots, split)
@@ -54,7 +54,7 @@ def listed_split(folder: Path, shots: Sequence[Shot], split: str) -> list[Shot]:
     found = [by_name[stem] for name in names if (stem := Path(name).stem) in by_name]
     missing = [name for name in names if Path(name).stem not in by_name]
     if not names:
-        raise DataError(f"{path}: expected names of photographs, got an empty file")
+        raise DataError(f"{path}: expected names of photographs, but the file is empty")
     left_out(str(path), missing, len(names))
     return found
 
@@ -68,7 +68,7 @@ def check_skew(skew: float, lens: Lens, where: str) -> None:
     lean = abs(skew) * lens.height / 2 / lens.focal[1]
     if not lean <= SKEW:
         raise DataError(
-            f"{where}: expected pixels with axes square to one another, got some that lean by "
+            f"{where}: expected pixels with perpendicular axes, got axes that are skewed by "
             f"{lean:.3g} pixels (skew {skew:.4g})"
         )
 

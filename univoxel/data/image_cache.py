@@ -1,4 +1,4 @@
-"""Photographs as training takes them, kept in a file: reading them again takes no time.
+"""Prepared photographs in a file, so that they need not be read again.
 
 Only what was shrunk or straightened is kept, and what is too large for memory; other photographs
 are read as fast from their files.
@@ -79,7 +79,7 @@ def to_be_kept(views: int, height: int, width: int) -> bool:
 @dataclass
 class Reading:
     """Photographs while they are read, one after the other: in memory, or where they are large in
-    the file where they are kept. There, reading that was ended goes on where it was."""
+    the file where they are kept. There, reading that was ended continues where it was."""
 
     color: Tensor  # [V, H, W, 3]
     alpha: Tensor  # [V, H, W]
@@ -216,11 +216,11 @@ def keep_photos(photos: Photos, path: Path) -> None:
         with replacing(path) as temporary:
             save_file(tensors, temporary, facts)
     except (OSError, SafetensorError) as error:
-        log.info("photographs are not kept for the next time: %s", error)
+        log.info("prepared photographs could not be stored for the next run: %s", error)
 
 
 def _origin_in(path: Path) -> str | None:
-    """The origin of what a file holds; None where there is no file of this kind."""
+    """The origin of what a file holds; None if there is no file of this kind."""
     try:
         with safe_open(path, "pt") as file:
             return (file.metadata() or {}).get("origin")

@@ -1,4 +1,4 @@
-"""Pictures in files: PNG, JPEG, OpenEXR and Radiance, read and written."""
+"""Image files: PNG, JPEG, OpenEXR and Radiance, reading and writing."""
 
 from __future__ import annotations
 
@@ -63,11 +63,11 @@ def read_radiance(path: Path) -> np.ndarray:
     """
     data = path.read_bytes()
     if not data.startswith(b"#?"):
-        raise DataError(f"{path}: expected a Radiance picture (first bytes '#?'), got {data[:8]!r}")
+        raise DataError(f"{path}: expected a Radiance image (first bytes '#?'), got {data[:8]!r}")
     head, blank, rest = data.partition(b"\n\n")
     line, newline, body = rest.partition(b"\n")
     if not (blank and newline):
-        raise DataError(f"{path}: expected a header and pixels, the file ends before")
+        raise DataError(f"{path}: expected a header and pixels, but the file is truncated")
     if form := re.search(rb"^FORMAT=(.*)$", head, re.MULTILINE):
         if form[1].strip() != b"32-bit_rle_rgbe":
             raise DataError(f"{path}: expected FORMAT=32-bit_rle_rgbe, got {form[1].strip()!r}")
@@ -153,7 +153,7 @@ def _run_lengths(path: Path, body: bytes, marker: bytes, height: int, width: int
     rows, at, size = bytearray(), 0, len(body)  # no memory for rows that a header alone promises
     for row in range(height):
         if body[at : at + 4] != marker:
-            raise DataError(f"{path}: row {row} of {height} is missing or broken")
+            raise DataError(f"{path}: row {row} of {height} is missing or damaged")
         at += 4
         for _ in range(4):
             left = width
@@ -167,7 +167,7 @@ def _run_lengths(path: Path, body: bytes, marker: bytes, height: int, width: int
                 else:
                     break
             if left or at > size:
-                raise DataError(f"{path}: row {row} of {height} is cut off or broken")
+                raise DataError(f"{path}: row {row} of {height} is truncated or damaged")
     return np.frombuffer(rows, np.uint8).reshape(height, 4, width)
 
 
@@ -197,9 +197,9 @@ FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")
 KINDS = {".exr": "an OpenEXR file", ".tif": "a TIFF", ".tiff": "a TIFF", ".webp": "a WebP"}
 # Axes that are flipped, by orientation in EXIF
 FLIPPED: dict[int, tuple[int, ...]] = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}
-HEIF = (".heic", ".heif", ".avif")  # of telephones
+HEIF = (".heic", ".heif", ".avif")  # of phones
 HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"mif1", b"msf1", b"avif", b"avis")
-LARGEST = 1 << 29  # pixels of a file: panoramas and the largest telephones have 200 million
+LARGEST = 1 << 29  # pixels of a file: panoramas and the largest phones have 200 million
 MOST_FRAMED = 1 << 29  # pixels of an EXR's display window, at most, where its data fill it in part
 # Endings of pictures that are not read: names may be those of files before they were converted
 FOREIGN = (*HEIF, ".hif", ".bmp", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
@@ -209,7 +209,7 @@ def read_image(path: str | Path, in_srgb: bool = False, infinite: bool = False) 
     """Read a picture, row 0 on top, channels in the order RGB(A) or grey.
 
     Args:
-        in_srgb: turn colours of a profile that the file holds, as of telephones, into sRGB.
+        in_srgb: turn colours of a profile that the file holds, as in phones, into sRGB.
         infinite: let an OpenEXR file hold infinity.
 
     Returns:
@@ -225,7 +225,7 @@ def read_image(path: str | Path, in_srgb: bool = False, infinite: bool = False) 
     path = Path(path)
     _refuse_heif(path)
     if path.suffix.lower() not in SUFFIXES:
-        raise DataError(f"{path}: expected a picture ({' '.join(SUFFIXES)}), got '{path.suffix}'")
+        raise DataError(f"{path}: expected an image ({' '.join(SUFFIXES)}), got '{path.suffix}'")
     suffix = kind_of(path)
     if suffix == ".hdr":
         return torch.from_numpy(read_radiance(path))
@@ -248,7 +248,7 @@ def read_image(path: str | Path, in_srgb: bool = False, infinite: bool = False) 
 
 def kind_of(path: Path) -> str:
     """.exr or .hdr where a file is of that kind by its first bytes, otherwise what its name says; a
-    DataError where there is no such file, or it is empty."""
+    DataError if there is no such file, or it is empty."""
     _require_file(path)
     with path.open("rb") as file:
         head = file.read(4)
@@ -256,7 +256,7 @@ def kind_of(path: Path) -> str:
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """Width and height of a picture that Pillow or OpenEXR reads, from its beginning alone.
+    """Width and height of a picture that Pillow or OpenEXR reads, from its beginning only.
 
     Raises:
         DataError: the file is missing, empty, or not what its name says.
@@ -271,7 +271,7 @@ def image_size(path: str | Path) -> tuple[int, int]:
             low, high = file.header()["displayWindow"]
         return int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1
     except (OSError, ValueError, RuntimeError) as error:
-        raise DataError(f"{path}: expected an OpenEXR file, could not read it: {error}") from None
+        raise DataError(f"{path}: this OpenEXR file could not be read: {error}") from None
 
 
 def orientation(path: Path) -> int:
@@ -295,8 +295,8 @@ def turn_note(path: Path) -> str:
     if found < 5:  # no quarter turn
         return ""
     return (
-        f"; EXIF orientation {found} of {path.name} is not applied: cameras and masks are those of "
-        "the pixels as they are stored"
+        f"; the EXIF orientation {found} of {path.name} is not applied, because cameras and "
+        "masks refer to the stored pixels"
     )
 
 
@@ -327,7 +327,7 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
 
 
 def _read_exr(path: Path) -> tuple[dict[str, np.ndarray], Sequence[float]]:
-    """Channels as of `read_exr`, and the primaries that the file states, if any."""
+    """Channels as in `read_exr`, and the primaries that the file states, if any."""
     _require_file(path)
     try:
         with _exr(path, separate_channels=True) as file:
@@ -338,11 +338,11 @@ def _read_exr(path: Path) -> tuple[dict[str, np.ndarray], Sequence[float]]:
             stated = header.get("chromaticities", ())
             channels = {name: channel.pixels for name, channel in file.channels(part).items()}
     except (RuntimeError, ValueError, TypeError) as error:
-        raise DataError(f"{path}: expected an OpenEXR file, could not read it: {error}") from None
+        raise DataError(f"{path}: this OpenEXR file could not be read: {error}") from None
     if len(colored) > 1:
         raise DataError(
-            f"{path}: expected one picture, got parts with colours: {names}: write the one that is "
-            "meant into a file of its own"
+            f"{path}: expected one image, got several parts with colours: {names}: write the "
+            "part you want into its own file"
         )
     if len({pixels.shape for pixels in channels.values()}) != 1:
         raise DataError(f"{path}: expected channels of one size, got subsampled ones")
@@ -382,7 +382,7 @@ def write_png(path: str | Path, image: Tensor | np.ndarray) -> None:
         raise ValueError(f"write_png: image must be [H, W(, 3 or 4)], got {list(array.shape)}")
     if np.issubdtype(array.dtype, np.floating):
         if np.isnan(array).any():
-            raise ValueError(f"write_png: image for {path} holds NaN")
+            raise ValueError(f"write_png: the image for {path} contains NaN")
         array = (array.clip(0, 1) * 255 + 0.5).astype(np.uint8)
     if array.dtype != np.uint8:
         raise ValueError(f"write_png: image must be uint8 or floating, got {array.dtype}")
@@ -464,8 +464,8 @@ def _without_stderr() -> Iterator[None]:
 def _refuse_heif(path: Path) -> None:
     if path.suffix.lower() in HEIF:
         raise DataError(
-            f"{path}: expected a picture ({' '.join(SUFFIXES)}), got '{path.suffix}': convert the "
-            "photographs to JPEG, as `univoxel poses` does"
+            f"{path}: expected an image file ({' '.join(SUFFIXES)}), got '{path.suffix}': "
+            "convert the photographs to JPEG, as `univoxel poses` does"
         )
 
 
@@ -511,7 +511,7 @@ def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
     except DataError:
         raise
     except AssertionError:  # Pillow's own, of what it takes for granted
-        raise DataError(f"{path}: expected {kind}, got one without its palette") from None
+        raise DataError(f"{path}: expected {kind}, but the palette is missing") from None
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise DataError(f"{path}: expected {kind}, {_what_it_is(path, error)}") from None
 
@@ -525,7 +525,7 @@ def as_array(image: Image.Image, path: Path, in_srgb: bool = False) -> np.ndarra
     if image.mode.startswith("I;16"):
         return np.asarray(image, np.float32)[..., None] / 65535
     if image.mode in ("I", "F"):
-        raise DataError(f"{path}: expected a picture of 8 or 16 bits, got one of 32: write it as 8")
+        raise DataError(f"{path}: expected an image of 8 or 16 bits, got 32: convert it")
     grey = image.mode in ("1", "L")
     mode = "L" if grey else "RGBA" if image.has_transparency_data else "RGB"
     source = image
@@ -563,8 +563,8 @@ def srgb_of(picture: Image.Image, source: Image.Image) -> Image.Image:
     if source.format == "PNG" and path.name and (code := _code_points(path)):
         gamma, primaries = 1 / SRGB_POWER, CODED.get(code[0], REC_709)
         if code[1] in HDR_CURVES:
-            said = f"{path}: expected colours of sRGB, got {HDR_CURVES[code[1]]} (HDR)"
-            raise DataError(f"{said}: write pictures without HDR")
+            said = f"{path}: expected sRGB colours, got {HDR_CURVES[code[1]]} (HDR)"
+            raise DataError(f"{said}: save the photographs without HDR")
     if primaries is ADOBE_RGB or abs(gamma * SRGB_POWER - 1) > 0.05:
         tone = 255 * linear_to_srgb((torch.arange(256) / 255) ** (1 / gamma))
         table, alpha = 3 * tone.round().int().tolist(), [*range(256)]
@@ -587,7 +587,7 @@ def _code_points(path: Path) -> bytes:
 
 
 def _by_profile(picture: Image.Image, profile: bytes) -> Image.Image:
-    """A picture as of `srgb_of`, by an ICC profile. What it is called says nothing."""
+    """A picture as in `srgb_of`, by an ICC profile. What it is called says nothing."""
     alpha = picture.getchannel("A") if picture.mode == "RGBA" else None
     flat = picture.convert("RGB") if alpha else picture
     try:
@@ -618,9 +618,9 @@ def is_heif(path: Path) -> bool:
 def _what_it_is(path: Path, error: Exception) -> str:
     """Why a file could not be read: it may be of another kind than its name says."""
     if is_heif(path):
-        return "got HEIC or AVIF under that name: convert it to JPEG, as `univoxel poses` does"
+        return "it is in fact HEIC or AVIF: convert it to JPEG, as `univoxel poses` does"
     with path.open("rb") as file:
         head = file.read(4)
     if head in (b"II*\0", b"MM\0*"):
-        return f"could not read this TIFF: {error}: convert it to PNG or JPEG of 8 bits"
-    return f"could not read it: {error}"
+        return f"this TIFF could not be read: {error}: convert it to PNG or JPEG with 8 bits"
+    return f"it could not be read: {error}"

@@ -1,4 +1,4 @@
-"""Lenses that bend straight lines, and the pinholes that their pictures are turned into."""
+"""Lens distortion, and the pinhole cameras of undistorted images."""
 
 from __future__ import annotations
 
@@ -66,14 +66,14 @@ def checked(lens: Lens) -> Lens:
     if not all(low <= focal <= high for focal in lens.focal):
         x, y = lens.focal
         raise UserError(
-            f"expected focal lengths from {low:.4g} to {high:.4g} pixels for pictures of "
+            f"expected focal lengths from {low:.4g} to {high:.4g} pixels for images of "
             f"{lens.width}x{lens.height}, got {x:.4g} and {y:.4g}"
         )
     if not all(abs(at) <= high for at in lens.centre):
-        raise UserError(f"expected a centre within {high:.4g} pixels, got {lens.centre}")
+        raise UserError(f"expected a principal point within {high:.4g} pixels, got {lens.centre}")
     if not all(abs(k) <= STRONGEST for k in (*lens.radial, *lens.tangential)):
         raise UserError(
-            f"expected coefficients of distortion up to {STRONGEST:.0e}, got "
+            f"expected distortion coefficients up to {STRONGEST:.0e}, got "
             f"{(*lens.radial, *lens.tangential)}"
         )
     return lens
@@ -91,13 +91,13 @@ def straightened(lens: Lens) -> Lens:
         return lens
     low, high = ZOOM
     if not _fits(lens, high):
-        raise UserError(f"its distortion leaves less than 1/{high:g} of the picture's width")
+        raise UserError(f"its distortion leaves less than 1/{high:g} of the image width")
     for _ in range(HALVINGS):
         middle = (low + high) / 2
         low, high = (low, middle) if _fits(lens, middle) else (middle, high)
     pinhole = _zoomed(lens, high)
     if _folds(lens, pinhole):
-        raise UserError("its distortion folds the picture over: check the coefficients")
+        raise UserError("its distortion folds the image over: check the coefficients")
     return pinhole
 
 
@@ -179,7 +179,7 @@ def fitted(lens: Lens, picture: Path, where: str) -> Lens:
     across, down = w / lens.width, h / lens.height
     if abs(across / down - 1) > TALLER + 1 / min(w, h):
         raise DataError(
-            f"{picture}: expected a picture of the shape {lens.width:g}x{lens.height:g} as in "
+            f"{picture}: expected an image with the shape {lens.width:g}x{lens.height:g} as in "
             f"{where}, got {w}x{h}{turn_note(picture)}"
         )
     (fx, fy), (cx, cy) = lens.focal, lens.centre

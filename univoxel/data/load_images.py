@@ -1,4 +1,4 @@
-"""From posed files to `Photos`: what the loaders of all layouts share."""
+"""From posed image files to `Photos`: code that the loaders of all layouts share."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ LEAN = math.radians(30)
 FAR = 1000
 OPAQUE = 0.98  # of alpha: some programs write 254 where there is nothing but the object
 LOOKED_AT = 12  # photographs, at most, on which it is tried whether masks can be right
-HOW_TO_MASK = "cut the object out with `univoxel cutout`, or see docs/guide/masks.md"
+HOW_TO_MASK = "cut out the object with `univoxel cutout`, or see docs/guide/masks.md"
 
 
 @dataclass(frozen=True)
@@ -64,10 +64,10 @@ class Shot:
     where: str  # for messages: what says that it is there
     image: Path
     mask: Path | None  # a picture of its own that the data name; None: `read_shots` looks for it
-    pose: np.ndarray  # [3, 4] camera-to-world, axes as of `Cameras`
+    pose: np.ndarray  # [3, 4] camera-to-world, axes as in `Cameras`
     lens: Lens
     beside: Path | None = None  # a mask that counts where the photograph has no alpha
-    moved: np.ndarray | None = None  # [3, 4] from the files' world to `pose`'s, as of `Photos`
+    moved: np.ndarray | None = None  # [3, 4] from the files' world to `pose`'s, as in `Photos`
 
 
 @dataclass(frozen=True)
@@ -107,8 +107,8 @@ def read_shots(
     masks = bool(masks)
     _check(folder, shots, downscale)
     if split == "train" and len(shots) < FEWEST:
-        count = "one photograph shows" if len(shots) == 1 else "two photographs show"
-        log.warning("%s: %s no shape: at least %d views are needed", folder, count, FEWEST)
+        count = "one view does" if len(shots) == 1 else "two views do"
+        log.warning("%s: %s not give a shape: at least %d are needed", folder, count, FEWEST)
     factor = downscale or fitting_downscale(shots)
     pinholes = _pinholes(shots)
     cameras = cameras_of([s.pose for s in shots], [shrunk(lens, factor) for lens in pinholes])
@@ -121,8 +121,8 @@ def read_shots(
     color, alpha = pixels or _read_all(folder, shots, pinholes, cameras, factor, masks, origin)
 
     told = [f"{len(shots)} photographs of {_words(cameras)} pixels in {split}"]
-    told += ["lens distortion taken out"] if any(shot.lens.bent for shot in shots) else []
-    told += [f"shrunk to 1/{factor}"] if factor > 1 else []
+    told += ["lens distortion removed"] if any(shot.lens.bent for shot in shots) else []
+    told += [f"downscaled to 1/{factor}"] if factor > 1 else []
     return Photos(
         folder=folder,
         names=[shot.name for shot in shots],
@@ -220,8 +220,8 @@ def _read_all(
     if upright is not None:
         turned = sum(orientation(image) != 1 for image, _ in pairs)
         log.info(
-            "%d photographs have an EXIF orientation: their masks are taken as made of %s",
-            *(turned, "the upright picture" if upright else "the pixels as they are stored"),
+            "%d photographs have an EXIF orientation: their masks seem to be made for %s",
+            *(turned, "the upright image" if upright else "the stored pixels"),
         )
     reading = Reading.resumed(origin)
     begin = reading.read if reading else 0
@@ -235,8 +235,8 @@ def _read_all(
                 reading = Reading.begun(origin, color, alpha, size)
             if color.dtype != reading.color.dtype:
                 raise DataError(
-                    f"{shots[view].image}: expected the format of {shots[0].name} in all "
-                    "photographs"
+                    f"{shots[view].image}: expected all photographs in the format of "
+                    f"{shots[0].name}"
                 )
             if alpha.dtype != reading.alpha.dtype:
                 alpha, reading = coverage_of(alpha), reading.with_floating_alpha()
@@ -250,9 +250,9 @@ def _read_all(
     if reading.empty or (masks and reading.opaque):
         reading.drop()
     if reading.empty:
-        raise DataError(f"{folder}: all {len(shots)} pictures are fully transparent")
+        raise DataError(f"{folder}: all {len(shots)} images are fully transparent")
     if masks and reading.opaque:
-        raise WithoutMasks(f"{folder}: all {len(shots)} pictures are fully opaque: {HOW_TO_MASK}")
+        raise WithoutMasks(f"{folder}: all {len(shots)} images are fully opaque: {HOW_TO_MASK}")
     if masks:
         looked = range(0, len(shots), -(-len(shots) // LOOKED_AT))
         some = [[cameras.cut(v, r[v]) for r in (reading.color, reading.alpha)] for v in looked]
@@ -264,8 +264,8 @@ def _read_all(
         _tell_odd(folder, shots, [cameras.cut(v, a) for v, a in enumerate(reading.alpha)])
         if premultiplied(some):
             log.warning(
-                "%s: colours seem to be multiplied by alpha: they come out dark along the object's "
-                "edge. Write photographs with straight alpha",
+                "%s: the colours seem to be premultiplied by alpha, so they are dark along the "
+                "object's edge. Save the photographs with straight alpha",
                 folder,
             )
     return reading.finished()
@@ -279,7 +279,7 @@ def _tell_odd(folder: Path, shots: Sequence[Shot], alphas: Sequence[Tensor]) -> 
         names = [shot.name for shot, said in zip(shots, odd, strict=True) if said]
         if names:
             log.warning(
-                "%s: by their masks %d of %d photographs show %s: %s",
+                "%s: according to their masks, %d of %d photographs show %s: %s",
                 *(folder, len(names), len(shots), what, some(names)),
             )
 
@@ -337,12 +337,12 @@ def read_photo(
 
     Args:
         masks: False to look for none: alpha is 1 everywhere.
-        upright: as of `masks.laid_over`.
+        upright: as in `masks.laid_over`.
     """
     image = read_image(path, in_srgb=True)
     channels = image.shape[-1]
     if channels not in (3, 4):
-        raise DataError(f"{path}: expected a picture with 3 or 4 channels, got {channels}")
+        raise DataError(f"{path}: expected an image with 3 or 4 channels, got {channels}")
     color, linear = image[..., :3], image.is_floating_point()
     alpha = image[..., 3] if channels == 4 else None
     opaque = 1 if linear else 255
@@ -461,7 +461,7 @@ def every_eighth(folder: Path, shots: Sequence[Shot], split: str) -> list[Shot]:
     ordered = sorted(shots, key=lambda shot: shot.name)
     chosen = [s for i, s in enumerate(ordered) if (i % TEST_EVERY == 0) == (split == "test")]
     if not chosen:
-        raise DataError(f"{folder}: expected two photographs at least, got {len(ordered)}")
+        raise DataError(f"{folder}: expected at least two photographs, got {len(ordered)}")
     return chosen
 
 
@@ -513,7 +513,7 @@ def upright(shots: Sequence[Shot]) -> tuple[list[Shot], list[str]]:
     held = np.stack([_right_and_up(shot) for shot in shots])
     up = up_direction(held)
     if up is None:
-        return shots, [*moved, "world as in the files: its cameras do not say what is up"]
+        return shots, [*moved, "world not turned upright: its cameras do not show what is up"]
     if up[2] >= math.cos(LEAN):
         return shots, moved
     turned = in_moved_world(shots, np.column_stack([turn_to_z(up), np.zeros(3)]))
@@ -563,7 +563,7 @@ def up_direction(held: np.ndarray) -> np.ndarray | None:
 def check_name(name: str, where: str) -> None:
     """Refuse, by a DataError, names of views with which files would not stay in their folder."""
     if name in ("", "..") or Path(name).name != name or not system.can_be_a_name(name):
-        raise DataError(f"{where}: expected names that files can have, got {name!r}")
+        raise DataError(f"{where}: expected valid file names, got {name!r}")
 
 
 def _check(folder: Path, shots: Sequence[Shot], downscale: int) -> None:
@@ -572,10 +572,10 @@ def _check(folder: Path, shots: Sequence[Shot], downscale: int) -> None:
     for shot in shots:
         check_name(shot.name, shot.where)
         if (key := system.file_key(shot.name)) in names:
-            raise DataError(f"{shot.where}: the name {shot.name} of {shot.image} came before")
+            raise DataError(f"{shot.where}: the name {shot.name} of {shot.image} occurs twice")
         names.add(key)
         width, height = shot.lens.width, shot.lens.height
         if downscale > min(width, height):
             raise DataError(
-                f"{folder}: downscale={downscale} leaves nothing of {width}x{height}", "downscale"
+                f"{folder}: downscale={downscale} leaves no pixels of {width}x{height}", "downscale"
             )

@@ -1,4 +1,4 @@
-"""Masks in files of their own: whose each is, what its numbers mean, how it lies on pixels."""
+"""Mask files: the photograph, values and orientation of each."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def masks_in(folder: Path, photographs: Named) -> list[Path]:
         raise DataError(f"{folder}: expected a folder of masks, got {what}", "masks")
     files = _pictures(folder)
     if not files:
-        raise DataError(f"{folder}: expected masks ({' '.join(SUFFIXES)}), got no picture")
+        raise DataError(f"{folder}: expected masks ({' '.join(SUFFIXES)}), found no image")
     found = _paired(files, folder, photographs)
     require_all(folder, photographs, [mask is not None for mask in found])
     return [mask for mask in found if mask]
@@ -122,7 +122,7 @@ def require_all(where: Path, photographs: Named, masked: Sequence[bool]) -> None
 
 
 def masks_beside(photographs: Named) -> list[Path | None]:
-    """The mask of each photograph that lies beside it, such as IMG_1_mask.png.
+    """The mask of each photograph that is beside it, such as IMG_1_mask.png.
 
     Raises:
         DataError: two masks are of one photograph.
@@ -213,8 +213,8 @@ def _paired(masks: Sequence[Path], root: Path | None, photographs: Named) -> lis
         mask = best[0] if best else None
         if root is not None and mask and whose.setdefault(mask, image) != image:
             raise DataError(
-                f"{mask}: expected a mask of one photograph, its name is that of {whose[mask]} and "
-                f"{image}: put masks into folders of the same names, or call them as "
+                f"{mask}: expected a mask of one photograph, but its name matches {whose[mask]} "
+                f"and {image}: put masks into folders with the same names, or name them like "
                 f"{image.name}.png"
             )
         found.append(mask)
@@ -306,7 +306,7 @@ def read_mask(
 
     Args:
         photograph: of this size, which EXIF may say to turn.
-        upright: as of `laid_over`.
+        upright: as in `laid_over`.
 
     Raises:
         DataError: it cannot be read, is none, or has another shape.
@@ -386,7 +386,7 @@ def _of_wide_numbers(values: np.ndarray, path: Path) -> Tensor:
     """Of a picture of 32 bits: of 0 and 1, or as much as 8 or 16 bits hold."""
     top = float(values.max())
     if not np.isfinite(values).all() or top > 65535:
-        raise DataError(f"{path}: expected a mask of numbers up to 65535, got up to {top:g}")
+        raise DataError(f"{path}: expected mask values up to 65535, got up to {top:g}")
     return _scaled(torch.from_numpy(values / (65535 if top > 255 else 1)), path)
 
 
@@ -402,7 +402,7 @@ def _of_palette(image: Image.Image, path: Path) -> Tensor:
     if len(things) > 1 or palette[0].any():
         named = [f"{n}: {palette[min(n, len(palette) - 1)].tolist()}" for n in used]
         raise DataError(
-            f"{path}: expected a mask of one object, got a palette of {len(used)} colours "
+            f"{path}: expected a mask of one object, got a palette with {len(used)} colours "
             f"({some(named)}): {WHITE}"
         )
     return torch.from_numpy(255 * (numbers > 0).astype(np.uint8))
@@ -435,7 +435,7 @@ def _brightness(image: Tensor, path: Path) -> Tensor:
     usual = tones.median(0).values
     one = ((tones - usual).abs().amax(-1) < HUE).float().mean() >= MOST
     if not one or count < MOST * int((largest > COLORED * unit).sum()):
-        raise DataError(f"{path}: expected a mask, got a picture of several colours: {WHITE}")
+        raise DataError(f"{path}: expected a mask, got an image with several colours: {WHITE}")
     strongest = image[..., int(usual.argmax())]
     if image.is_floating_point():
         return strongest / strongest.max()
@@ -459,8 +459,8 @@ def _scaled(levels: Tensor, path: Path) -> Tensor:
     code = round(255 * top) if floating else int(top)
     if code <= LABELS:
         raise DataError(
-            f"{path}: expected a mask, white on the object, got a largest value of {code} of 255, "
-            f"as of numbers of several things: {WHITE}"
+            f"{path}: expected a mask that is white on the object, got a maximum of {code} of "
+            f"255, as in label images: {WHITE}"
         )
     return levels.clamp(0, 1) if floating else levels.contiguous()
 
@@ -477,7 +477,7 @@ def made_upright(pairs: Sequence[tuple[Path, Path]]) -> bool | None:
         pairs: photographs and their masks.
 
     Returns:
-        None where no photograph is turned without its mask.
+        None if no photograph is turned without its mask.
     """
     asked = [(image, mask) for image, mask in pairs if orientation(image) != 1 == orientation(mask)]
     if not asked:
@@ -507,8 +507,8 @@ def require_fit(where: Path, views: Sequence[tuple[Tensor, Tensor]]) -> None:
     largest = max(float(mask.max()) for _, mask in views)
     if largest < 0.5 and len(views) >= FEWEST:
         raise DataError(
-            f"{where}: expected masks that are white on the object, got a largest value of "
-            f"{255 * largest:.0f} of 255 in {len(views)} that were looked at: {WHITE}"
+            f"{where}: expected masks that are white on the object, got a maximum of "
+            f"{255 * largest:.0f} of 255 in {len(views)} samples: {WHITE}"
         )
     inverted, ways = 0, []
     for color, mask in views:
@@ -517,17 +517,15 @@ def require_fit(where: Path, views: Sequence[tuple[Tensor, Tensor]]) -> None:
         ways.append(_fitting_way(picture, mask))
     if inverted >= USUAL * len(views):
         raise DataError(
-            f"{where}: {inverted} of {len(views)} masks that were looked at are white along the "
-            "whole border of the picture and black within: they seem to be inverted. Give masks "
-            "that are white on the object and black elsewhere, as `magick mogrify -negate "
-            "masks/*.png` makes them"
+            f"{where}: {inverted} of {len(views)} sampled masks are white along the whole image "
+            "border and black inside, so they seem to be inverted. Use masks that are white on "
+            "the object and black elsewhere; `magick mogrify -negate masks/*.png` inverts them"
         )
     way = max(set(ways), key=ways.count)
     if way != 1 and len(ways) >= FEWEST and ways.count(way) >= USUAL * len(ways):
         raise DataError(
-            f"{where}: {ways.count(way)} of {len(ways)} masks that were looked at fit their "
-            f"photographs when {WAYS[way]}, and do not as they are: give masks of the pixels as "
-            "they are stored"
+            f"{where}: {ways.count(way)} of {len(ways)} sampled masks fit their photographs only "
+            f"when {WAYS[way]}: save the masks in the orientation of the stored pixels"
         )
 
 

@@ -1,5 +1,4 @@
-"""Files that a data set names: whether they lie in its folder and are there, and arrays in those
-of NumPy."""
+"""Files that a data set names: they must exist inside its folder; and NumPy arrays in files."""
 
 from __future__ import annotations
 
@@ -38,8 +37,8 @@ def inside(path: Path, where: str) -> Path:
     folder = _folder.get()
     if folder is not None and not path.resolve().is_relative_to(folder):
         raise DataError(
-            f"{where}: expected files in {folder}, got {path.resolve()}: if you trust where the "
-            "data comes from, set allow_outside",
+            f"{where}: expected files inside {folder}, got {path.resolve()}: if you trust the "
+            "source of the data, set allow_outside",
             "allow_outside",
         )
     return path
@@ -71,11 +70,11 @@ def left_out(where: str, missing: Sequence[object], listed: int, note: str = "")
     count = f"{len(missing)} of {listed}"
     if listed - len(missing) < max(FEWEST, SHARE * listed):
         raise DataError(
-            f"{where}: no picture {names}: {count} are missing, expected half of them at least, "
-            f"and {FEWEST}{note}"
+            f"{where}: missing images: {names} ({count}); expected at least half of them, and at "
+            f"least {FEWEST}{note}"
         )
-    log.warning("%s: no picture %s: %s left out", where, names, count)
-    return [f"{count} listed left out: no such pictures"]
+    log.warning("%s: missing images: %s (%s left out)", where, names, count)
+    return [f"{count} listed images left out because they are missing"]
 
 
 # Arrays in the files of NumPy.
@@ -97,9 +96,9 @@ def read_npy(path: Path) -> np.ndarray:
         with path.open("rb") as stream:
             array = np.load(stream, allow_pickle=False)
     except BROKEN as error:
-        raise DataError(f"{path}: expected an array of NumPy, could not read it: {error}") from None
+        raise DataError(f"{path}: this NumPy array could not be read: {error}") from None
     if not isinstance(array, np.ndarray):
-        raise DataError(f"{path}: expected one array of NumPy, got an archive of several")
+        raise DataError(f"{path}: expected one NumPy array, got an archive of several")
     return array
 
 
@@ -114,7 +113,7 @@ def read_npz(path: Path, prefix: str = "") -> dict[str, np.ndarray]:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             found = {key: file[key] for key in file.files if key.startswith(prefix)}
     except BROKEN as error:
-        raise DataError(f"{path}: expected an npz file, could not read it: {error}") from None
+        raise DataError(f"{path}: this npz file could not be read: {error}") from None
     for key, value in found.items():
         if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
             kind = value.dtype if isinstance(value, np.ndarray) else type(value).__name__

@@ -106,7 +106,7 @@ def list_metashape(folder: Path, split: str) -> Listed:
     if len(every) > len(chosen):
         told = "not placed, not enabled or in another component"
         if rig := sum(c.get("master_id") is not None for c in every if c not in placed):
-            told += f"; {rig} of a rig, whose place is that of a master camera"
+            told += f"; {rig} belong to a rig, whose pose is that of a master camera"
         lost += [f"{len(every) - len(chosen)} of {len(every)} cameras left out: {told}"]
     return turned_up(folder, split, "Metashape cameras", shots, lost)
 
@@ -118,11 +118,11 @@ def _xml_file(folder: Path) -> Path | None:
 def _chunk(path: Path) -> ET.Element:
     data = inside(path, str(path)).read_bytes()
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:  # which may grow without bound
-        raise DataError(f"{path}: expected XML of Metashape, got one with definitions of its own")
+        raise DataError(f"{path}: expected Metashape XML, got XML with its own definitions")
     try:
         root = ET.fromstring(data)
     except ET.ParseError as error:
-        raise DataError(f"{path}: expected XML, could not read it: {error}") from None
+        raise DataError(f"{path}: this XML could not be read: {error}") from None
     chunks = root.findall("chunk")
     if len(chunks) != 1:
         raise DataError(f"{path}: expected one chunk, got {len(chunks)}")
@@ -165,13 +165,13 @@ def _camera_pose(camera: ET.Element, world: tuple[float, np.ndarray], where: str
 def _sensor_lens(sensor: ET.Element | None, where: str) -> Lens:
     """The lens of a sensor, in the terms of OpenCV."""
     if sensor is None:
-        raise DataError(f"{where}: expected it among the sensors, got none")
+        raise DataError(f"{where}: expected a known sensor, but it is not listed")
     if (kind := sensor.get("type", "frame")) != "frame":
         raise DataError(f"{where}: expected a sensor of type frame, got {kind}")
     calibrations = sensor.findall("calibration")
     adjusted = [c for c in calibrations if c.get("class", "adjusted") == "adjusted"]
     if not calibrations:
-        raise DataError(f"{where}: expected a calibration, got none")
+        raise DataError(f"{where}: expected a calibration, found none")
     calibration = (adjusted or calibrations)[0]
     resolution = calibration.find("resolution")
     resolution = sensor.find("resolution") if resolution is None else resolution
@@ -182,7 +182,7 @@ def _sensor_lens(sensor: ET.Element | None, where: str) -> Lens:
     focal = parsed(calibration.findtext("f"), "f", where)
     term = {key: parsed(calibration.findtext(key, "0"), key, where) for key in TERMS}
     if term["p3"] or term["p4"]:
-        raise DataError(f"{where}: expected distortion by k1 to k4, p1 and p2, got p3 or p4 too")
+        raise DataError(f"{where}: expected distortion k1 to k4, p1 and p2, got p3 or p4 too")
     values = {"fl_x": focal + term["b1"], "fl_y": focal}
     values |= {"cx": width / 2 + term["cx"], "cy": height / 2 + term["cy"]}
     values |= {"p1": term["p2"], "p2": term["p1"]}
@@ -249,7 +249,7 @@ def _text(data: bytes, errors: str = "strict") -> str:
 
 
 def _delimiter(line: str) -> str | None:
-    """What stands between the names of the columns; None where it is no line of them."""
+    """What stands between the names of the columns; None if it is no line of them."""
     return next((d for d in DELIMITERS if set(REQUIRED) <= set(_columns(line, d))), None)
 
 
@@ -279,7 +279,7 @@ def _rows(path: Path) -> list[tuple[int, dict[str, str]]]:
             row |= {key: v.replace(",", ".") for key, v in row.items() if key != "name"}
         rows.append((number, row))
     if not rows:
-        raise DataError(f"{path}: expected a line for each camera, got none")
+        raise DataError(f"{path}: expected a line per camera, got none")
     return rows
 
 
@@ -304,7 +304,7 @@ def _row_pose(row: dict[str, str], where: str) -> np.ndarray:
 # Polycam's raw data, as its developer mode exports them.
 #
 # keyframes/corrected_cameras/<time>.json    fx, fy, cx, cy, width, height, and t_00 to t_23:
-#                                            camera-to-world, axes as of ARKit; or keyframes/cameras
+#                                            camera-to-world, axes as in ARKit; or keyframes/cameras
 # keyframes/corrected_images/<time>.jpg      photographs; or keyframes/images
 # keyframes/masks/<time>.png                 masks, which Polycam does not make; or masks
 #
@@ -342,7 +342,7 @@ def list_polycam(folder: Path, split: str) -> Listed:
     note = f" (looked in {pictures}"
     others = folder / f"{place.removesuffix('corrected_')}images"
     if others != pictures and others.is_dir():
-        note += f"; those in {others} are of the cameras in {others.with_name('cameras')}"
+        note += f"; those in {others} belong to the cameras in {others.with_name('cameras')}"
     lost = left_out(str(cameras[0].parent), missing, len(cameras), f"{note})")
     shots = every_eighth(folder, in_moved_world(shots, UPRIGHT), split)
     return Listed("Polycam raw data", shots, [*lost, "world turned from +Y to +Z up"])

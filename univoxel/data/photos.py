@@ -1,4 +1,4 @@
-"""What every loader returns."""
+"""The records that every loader returns."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Photos:
     cameras: Cameras
     about: str = ""  # what was read and how, for people
     downscale: int = 1  # pixels of the files along a side of one of these
-    origin: str = ""  # of pixels that are not those of the files, as of `image_cache.origin_of`
+    origin: str = ""  # of pixels that are not those of the files, as in `image_cache.origin_of`
     # Read the file of each photograph again, shrunk to 1/factor: stored colour [H, W, 3], as its
     # pinhole sees it. Empty where photographs are from no files
     readers: tuple[Callable[[int], Tensor], ...] = ()

@@ -1,4 +1,4 @@
-"""Layouts that research publishes its scenes in: LLFF, IDR, NeILF, TensoIR."""
+"""Layouts of published research data sets: LLFF, IDR, NeILF, TensoIR."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def _llff_pictures(folder: Path) -> list[Path]:
         if pictures := photographs_in(place):
             return pictures
     raise DataError(
-        f"{folder / LLFF_FILE}: no pictures in {folder / 'images'} or images_2, images_4 .."
+        f"{folder / LLFF_FILE}: no images in {folder / 'images'} or images_2, images_4 ..."
     )
 
 
@@ -155,11 +155,11 @@ def decomposed(matrix: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
         matrix: [3, 4], of any scale and sign.
 
     Returns:
-        K with 1 at its end, and the pose, its axes as of `Cameras`.
+        K with 1 at its end, and the pose, its axes as in `Cameras`.
     """
     matrix = matrix * (1 if np.linalg.det(matrix[:, :3]) > 0 else -1)
     if not np.linalg.cond(matrix[:, :3]) < 1e12:
-        raise DataError(f"{where}: expected a projection onto a picture, got a singular matrix")
+        raise DataError(f"{where}: expected a projection matrix, got a singular one")
     upper, rotation = rq(matrix[:, :3])
     signs = np.sign(np.diag(upper))  # focal lengths are positive; that they are so is all there is
     upper, rotation = upper * signs, signs[:, None] * rotation
@@ -185,7 +185,7 @@ def _matrices(path: Path) -> dict[int, np.ndarray]:
                 f"{list(matrix.shape)} of {matrix.dtype}"
             )
         if not np.isfinite(matrix).all():
-            raise DataError(f"{path}: world_mat_{number} holds NaN or infinity")
+            raise DataError(f"{path}: world_mat_{number} contains NaN or infinity")
     return {number: matrix[:3].astype(np.float64) for number, matrix in found.items()}
 
 
@@ -194,7 +194,7 @@ def _idr_pictures(folder: Path, path: Path) -> list[Path]:
     for name in IMAGES:
         if found := photographs_in(folder / name):
             return _ordered(found)
-    raise DataError(f"{path}: no pictures in {folder / IMAGES[0]}")
+    raise DataError(f"{path}: no images in {folder / IMAGES[0]}")
 
 
 def _ordered(pictures: list[Path]) -> list[Path]:
@@ -276,7 +276,7 @@ def list_neilf(folder: Path, split: str) -> Listed:
         lens, pose = _camera(image, where)
         shots.append(Shot(picture.stem, where, picture, None, pose, fitted(lens, picture, where)))
     if unplaced == len(names):
-        raise DataError(f"{path}: expected images with flg {PLACED}, which have cameras, got none")
+        raise DataError(f"{path}: expected images with cameras (flg {PLACED}), got none")
     looked = f" (looked in {folder / 'inputs' / 'images'})"
     lost = left_out(str(path), missing, len(names) - unplaced, looked)
     lost += [f"{unplaced} without a camera left out"] if unplaced else []

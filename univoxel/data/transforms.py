@@ -1,5 +1,5 @@
-"""Cameras in the JSON of NeRF: what its layouts share, NeRF-synthetic's and nerfstudio's, and
-camera paths without pictures."""
+"""Cameras in NeRF's JSON: common parts, NeRF-synthetic, nerfstudio, and camera paths without
+images."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def load_cameras(
     Args:
         size: pixels, width and height of the pictures to come where the file gives no w and h,
             for all or with a frame.
-        moved: from the file's world to that of the cameras, as of `Photos`.
+        moved: from the file's world to that of the cameras, as in `Photos`.
 
     Returns:
         A name for each frame, from its file_path or its number, and the cameras.
@@ -67,13 +67,13 @@ def load_cameras(
     """
     path = Path(path)
     if not path.is_file():
-        raise DataError(f"{path}: expected a file of cameras, got nothing there")
+        raise DataError(f"{path}: expected a file of cameras, but it does not exist")
     root, frames = read_transforms(path)
     names = view_names([str(f.get("file_path", f"{i:04d}")) for i, f in enumerate(frames)])
     for index, name in enumerate(names):
         load_images.check_name(name, f"{path}: frame {index}")
     if len(set(names)) != len(names):
-        raise DataError(f"{path}: expected every frame under a name of its own")
+        raise DataError(f"{path}: expected frames with unique names")
     poses, lenses = [], []
     for index, frame in enumerate(frames):
         where = f"{path}: frame {index}"
@@ -83,7 +83,7 @@ def load_cameras(
         width, height = (int(read_number(values, key, where, 0, WIDEST)) for key in ("w", "h"))
         lens = lens_of(values, where, width, height)
         if lens.bent:
-            raise DataError(f"{where}: expected cameras without lens distortion, got some")
+            raise DataError(f"{where}: expected cameras without distortion, got some")
         lenses.append(lens)
     return names, load_images.cameras_of(poses, lenses)
 
@@ -134,8 +134,8 @@ def read_frames(path: Path) -> tuple[dict[str, Any], list[load_images.Shot], lis
     if len(set(names)) < len(names):
         index = next(i for i, name in enumerate(names) if name in names[:i])
         raise DataError(
-            f"{path}: frame {index}: the name {names[index]} of {frames[index]['file_path']} came "
-            "before"
+            f"{path}: frame {index}: the name {names[index]} of {frames[index]['file_path']} "
+            "occurs twice"
         )
     shots, missing, scaled = [], [], 0
     for index, frame in enumerate(frames):
@@ -155,11 +155,11 @@ def read_frames(path: Path) -> tuple[dict[str, Any], list[load_images.Shot], lis
         c > OFF * n for c, n in zip(first.centre, (first.width, first.height), strict=True)
     ):
         log.warning(
-            "%s: cx and cy are at the border of pictures of %dx%d pixels: if they are of larger "
-            "ones, state the size of those as w and h",
+            "%s: cx and cy are at the border of the %dx%d images: if they refer to larger "
+            "images, add that size as w and h",
             *(path, first.width, first.height),
         )
-    lost += [f"cameras of {scaled} scaled to smaller pictures"] if scaled else []
+    lost += [f"cameras of {scaled} scaled to smaller images"] if scaled else []
     return root, shots, lost
 
 
@@ -181,7 +181,7 @@ def _smaller(missing: Sequence[Path]) -> str:
     if not others:
         return ""
     return (
-        f"; {others[0]} is there: rename it to {place.name}, and cameras are scaled to its pictures"
+        f"; {others[0]} exists: rename it to {place.name}, and the cameras are scaled to its images"
     )
 
 
@@ -201,10 +201,10 @@ def _folder(path: Path, frame: dict[str, Any], where: str) -> Path:
 
 
 def find_image(folder: Path, file_path: str, where: str) -> Path:
-    """The picture that a frame's file_path means, as of `listed_image`; a DataError without one."""
+    """The picture that a frame's file_path means, as in `listed_image`; a DataError without one."""
     found = listed_image(folder, file_path, where)
     if found is None:
-        raise DataError(f"{where}: no picture {folder / file_path} ({LOOKED_FOR})")
+        raise DataError(f"{where}: the image {folder / file_path} does not exist ({LOOKED_FOR})")
     return found
 
 
@@ -233,7 +233,7 @@ def _found_as_written_elsewhere(folder: Path, names: Sequence[str], where: str) 
             found = _in_any_case(folder, parts, known) if parts else []
             if len(found) > 1:
                 both = " and ".join(map(str, found[:2]))
-                raise DataError(f"{where}: expected one picture {path}, got {both}: rename one")
+                raise DataError(f"{where}: expected one image {path}, got {both}: rename one")
             if found:
                 return found[0]
     return None
@@ -255,7 +255,7 @@ def _in_any_case(
 
 
 def _entries(folder: Path) -> dict[str, list[Path]]:
-    """What is in a folder, by its name as of `system.folded`."""
+    """What is in a folder, by its name as in `system.folded`."""
     entries: dict[str, list[Path]] = {}
     with suppress(OSError):
         for path in sorted(folder.iterdir()):
@@ -321,7 +321,7 @@ def lens_of(values: dict[str, Any], where: str, width: int, height: int, note: s
     # Focal lengths are in pixels: of these pictures, or all is off.
     if (values.get("w", width), values.get("h", height)) != (width, height):
         raise DataError(
-            f"{where}: expected pictures of {values.get('w')}x{values.get('h')} pixels (w and h), "
+            f"{where}: expected images of {values.get('w')}x{values.get('h')} pixels (w and h), "
             f"got {width}x{height}{note}"
         )
     model = values.get("camera_model", "OPENCV")
@@ -331,7 +331,7 @@ def lens_of(values: dict[str, Any], where: str, width: int, height: int, note: s
             + ("a fisheye" if values.get("is_fisheye") else short(model))
         )
     if more := [key for key in ("k4", "k5", "k6") if values.get(key)]:
-        raise DataError(f"{where}: expected distortion by k1 k2 k3 p1 p2, got {more[0]} too")
+        raise DataError(f"{where}: expected distortion k1 k2 k3 p1 p2, got {more[0]} too")
     if "fl_x" in values:
         x = read_number(values, "fl_x", where, 0.0, math.inf)
         y = read_number(values, "fl_y", where, 0.0, math.inf) if "fl_y" in values else x
@@ -399,7 +399,7 @@ def _mask(folder: Path, frame: dict[str, Any], where: str) -> Path | None:
     if isinstance(named, str) and "\0" not in named:
         found = listed_image(folder, named, where)
     if found is None:
-        raise DataError(f"{where}: no mask {folder / str(named)[:200]} (mask_path)")
+        raise DataError(f"{where}: the mask {folder / str(named)[:200]} does not exist (mask_path)")
     return found
 
 
@@ -410,7 +410,7 @@ def _mask(folder: Path, frame: dict[str, Any], where: str) -> Path | None:
 # <file_path>_rgba.png        the same
 # <file_path>_rgb.exr         linear photograph, with <file_path>_mask.png
 # train/0001.exr              linear photograph, with train_mask/0001.png
-# transforms_novel.json       views of other scenes, as of Stanford-ORB: split "novel"
+# transforms_novel.json       views of other scenes, as in Stanford-ORB: split "novel"
 
 
 def is_blender(folder: Path, split: str) -> bool:
@@ -420,7 +420,7 @@ def is_blender(folder: Path, split: str) -> bool:
 def list_blender(folder: Path, split: str) -> load_images.Listed:
     path = folder / f"transforms_{split}.json"
     if not path.is_file():
-        raise DataError(f"{folder}: expected {path.name} beside transforms_train.json, got none")
+        raise DataError(f"{folder}: expected {path.name} beside transforms_train.json, found none")
     _, shots, remarks = read_frames(path)
     train = folder / "transforms_train.json"
     if train.is_file():  # all splits in one world
@@ -473,5 +473,5 @@ def _named(
         raise DataError(f"{path}: expected frames of the file in {key}, got {came}")
     found = [by_name[name] for name in names if name in by_name]
     if not found:
-        raise DataError(f"{path}: expected frames with pictures in {key}, got {len(names)} without")
+        raise DataError(f"{path}: expected frames with images in {key}, got {len(names)} without")
     return found

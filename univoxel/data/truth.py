@@ -1,5 +1,4 @@
-"""Ground truth beside the photographs: materials, normals, relit views, points and meshes of the
-surface."""
+"""Ground truth of a data set: materials, normals, relit views, points and meshes of the surface."""
 
 from __future__ import annotations
 
@@ -122,7 +121,7 @@ def read_ply(path: Path) -> Mesh:
     if (sides != 3).any() or (len(index) and not 0 <= index.min() <= index.max() < len(corner)):
         raise DataError(f"{path}: expected triangles of the {len(corner)} vertices")
     if not np.isfinite(corner).all():
-        raise DataError(f"{path}: expected vertices at finite places, got NaN or infinity")
+        raise DataError(f"{path}: expected finite vertices, got NaN or infinity")
     return Mesh(torch.from_numpy(corner), torch.from_numpy(index))
 
 
@@ -143,7 +142,7 @@ MAP_ENDINGS = (".hdr", ".exr")
 
 
 def load_truth(photos: Photos, view: int) -> Truth:
-    """Ground truth of a test view; an empty record where there is none.
+    """Ground truth of a test view; an empty record if there is none.
 
     The mask is where alpha > 250 of 255, so that no silhouette pixel counts: that of the npz, or of
     the photograph.
@@ -170,8 +169,8 @@ def relight_maps(folder: str | Path) -> dict[str, Path]:
         found = _map(folder / "envmaps", pictures.name)
         if found is None:
             raise DataError(
-                f"{pictures}: expected its map {folder / 'envmaps' / pictures.name}.hdr, "
-                f"got nothing there"
+                f"{pictures}: expected its environment map "
+                f"{folder / 'envmaps' / pictures.name}.hdr, but it does not exist"
             )
         maps[pictures.name] = found
     if maps:
@@ -198,15 +197,15 @@ def load_relit(photos: Photos, map: str) -> tuple[Tensor, Tensor]:
         found = tuple(n // photos.downscale for n in reversed(alpha.shape))
         if found != (size := photos.cameras.size(view)):
             raise DataError(
-                f"{path}: expected {size[0]}x{size[1]} pixels like the test view's, "
-                f"got {found[0]}x{found[1]}"
+                f"{path}: expected {size[0]}x{size[1]} pixels as in the test view, got "
+                f"{found[0]}x{found[1]}"
             )
         pictures.append(resampled(color, alpha, photos.downscale))
     return stacked([c for c, _ in pictures]), stacked([a for _, a in pictures])
 
 
 def load_points(folder: str | Path) -> Tensor | None:
-    """Points [P, 3] float32 on the true surface, world: points.npz, or None where there is none."""
+    """Points [P, 3] float32 on the true surface, world: points.npz, or None if there is none."""
     path = Path(folder) / "points.npz"
     if not path.is_file():
         return None
@@ -217,7 +216,7 @@ def load_points(folder: str | Path) -> Tensor | None:
     with np.errstate(over="ignore"):
         points = points.astype(np.float32)
     if not np.isfinite(points).all():
-        raise DataError(f"{path}: points hold NaN or infinity")
+        raise DataError(f"{path}: points contain NaN or infinity")
     return torch.from_numpy(points)
 
 
@@ -280,7 +279,7 @@ def _pictures(photos: Photos, view: int) -> Truth:
         if key == "roughness":
             value = value[..., 0]
         elif value.shape[2] != 3:
-            raise DataError(f"{path}: expected a picture with 3 or 4 channels, got 1")
+            raise DataError(f"{path}: expected an image with 3 or 4 channels, got 1")
         elif key == "normal":
             value = 2 * value - 1
         elif path in paths[:2]:
@@ -296,8 +295,8 @@ def _fitting(path: Path, value: Tensor, coverage: Tensor) -> Tensor:
     """A layer of truth where the photograph has something, if their sizes are the same."""
     if value.shape[:2] != coverage.shape:
         raise DataError(
-            f"{path}: expected {size_of(coverage)} pixels like the photograph's, "
-            f"got {size_of(value)}"
+            f"{path}: expected {size_of(coverage)} pixels as in the photograph, got "
+            f"{size_of(value)}"
         )
     return value * (coverage > 0).view(*coverage.shape, *[1] * (value.dim() - 2))
 

@@ -1,2 +1,2 @@
-"""Texture at the photographs' own resolution: made after training, used by novel views, relighting
-and exported meshes."""
+"""Textures at the photographs' resolution, made after training for novel views, relighting and
+export."""

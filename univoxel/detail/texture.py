@@ -1,4 +1,4 @@
-"""Albedo from the photographs at their own size, on the mesh of a trained scene.
+"""Albedo from full-size photographs, on the mesh of a trained scene.
 
 Training looks at photographs that were shrunk, through a grid that is coarser still. Its surface,
 cameras, light and roughness are good enough to take the light out of the photographs as they are:
@@ -132,7 +132,7 @@ class Detail:
         Args:
             points, normals: [N, 3] world; unit.
             albedo: [N, 3] that the field has there.
-            footprint: as of `at`.
+            footprint: as in `at`.
         """
         out = albedo.clone()
         for some in torch.arange(len(points)).split(AT_ONCE):
@@ -288,7 +288,7 @@ def make_detail(scene: Scene, photos: Photos, size: int | None = None) -> Detail
     voxel, middle = scene.field.voxel_size, torch.stack(scene.field.bounds()).mean(0)
     pixel = pixel_width(photos.cameras, middle) / photos.downscale
     if not photos.readers or voxel < PIXELS_OF_VOXEL * pixel:
-        log.debug("detail: none is made, photographs show no more than the grid holds")
+        log.debug("detail: not added, because the photographs are no finer than the grid")
         return None
     mesh = surface_of(scene, photos.cameras)
     mesh = simplify(mesh, min(FACES, len(mesh.faces)))
@@ -304,13 +304,13 @@ def make_detail(scene: Scene, photos: Photos, size: int | None = None) -> Detail
     errors = torch.tensor([baking.errors(view) for view in held])  # [H, 2]
     before, after = errors.nanmean(0).tolist() if len(held) else (math.nan, math.nan)
     if not after < before:
-        log.info("detail: none is made, it does not predict photographs that were held out")
+        log.info("detail: not added, because it does not predict validation photographs better")
         return None
     for view in held:
         baking.add(view)
     gain = -10 * math.log10(after / before)
     log.info(
-        "detail: a texture of %d x %d from %d photographs, %.1f dB nearer to held-out ones",
+        "detail: a texture of %d x %d from %d photographs, %.1f dB closer to validation",
         *(atlas.size, atlas.size, len(photos), gain),
     )
     albedo = baking.picture()
@@ -335,7 +335,7 @@ class _Atlas:
     uv: Tensor  # [Q, 2]
     texel: Tensor  # [K] int32 those in charts, row * size + column
     face: Tensor  # [K] int32
-    barycentric: Tensor  # [K, 2] float16, as of `ops.Hit`
+    barycentric: Tensor  # [K, 2] float16, as in `ops.Hit`
 
 
 def _atlas(mesh: Mesh, size: int) -> _Atlas:
@@ -500,14 +500,14 @@ def save_detail(detail: Detail, run: Path) -> None:
 
 
 def albedo_near(run: str | Path) -> AlbedoNear | None:
-    """What gives the albedo of a run where it has detail; errors as of `load_detail`."""
+    """What gives the albedo of a run where it has detail; errors as in `load_detail`."""
     detail = load_detail(run)
     return None if detail is None else detail.near
 
 
 def page_options(run: str | Path) -> dict[str, Any]:
     """Fields of `univoxel.output.page.PageOptions` that show the detail of a run, if it has any;
-    errors as of `load_detail`."""
+    errors as in `load_detail`."""
     near = albedo_near(run)
     return {} if near is None else {"albedo_near": near, "texture_size": PAGE_SIZE}
 
@@ -528,11 +528,11 @@ def load_detail(run: str | Path) -> Detail | None:
             tensors = {name: file.get_tensor(name) for name in file.keys()}
         if about.get("format") != FORMAT:
             came = f"{about.get('format')!r:.40}"
-            raise DataError(f"{path}: expected detail of format {FORMAT}, got {came}; {remedy}")
+            raise DataError(f"{path}: expected detail in format {FORMAT}, got {came}; {remedy}")
         if about["checkpoint"] != _fingerprint(Path(run)):
-            raise DataError(f"{path}: made for another checkpoint than {CHECKPOINT}; {remedy}")
+            raise DataError(f"{path}: it belongs to another checkpoint than {CHECKPOINT}; {remedy}")
         if about["picture"] != _digest(picture):
-            raise DataError(f"{picture}: not the one that {MESH} was written with; {remedy}")
+            raise DataError(f"{picture}: it is not the file that {MESH} was written with; {remedy}")
         albedo = torch.from_numpy(np.array(Image.open(picture).convert("RGB")))
         detail = Detail(**tensors, albedo=albedo, reach=float(about["reach"]))
         _check(detail)

@@ -1,7 +1,7 @@
-"""Novel views at any size: the model's light on the texture, and what it leaves of the photographs
-that were taken nearby; and how much of the photographs' own detail they show.
+"""Novel views at any size: the texture under the model's light, plus residuals of photographs
+nearby; and the share of the photographs' detail that they show.
 
-A view is albedo * A + B, as of `univoxel.detail.texture`, with the texture for albedo. What the
+A view is albedo * A + B, as in `univoxel.detail.texture`, with the texture for albedo. What the
 model of light cannot say, such as how single fibres glitter, the nearest photographs do: each pixel
 is multiplied by (photo / prediction) of those, by how near their directions are. With
 no photograph near, that is 1.
@@ -70,7 +70,7 @@ class DetailedViews:
     """Renders a scene with its detail."""
 
     def __init__(self, scene: Scene, detail: Detail, photos: Photos | None = None) -> None:
-        """With the photographs that were trained on, or None: views are the model's alone."""
+        """With the photographs that were trained on, or None: views are the model's only."""
         self.scene: Scene = scene
         self.detail: Detail = detail
         self.at: Vertices = vertices_of(scene, Mesh(detail.vertices, detail.faces))
@@ -87,7 +87,7 @@ class DetailedViews:
     def render(
         self, cameras: Cameras, view: int, coarse: Tensor, opacity: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """A view, premultiplied and linear [H, W, 3], and the same by the model alone.
+        """A view, premultiplied and linear [H, W, 3], and the same by the model only.
 
         Args:
             cameras: with pictures of the size that is asked for.
@@ -244,7 +244,7 @@ class Likeness:
 
 def likeness(picture: Tensor, photo: Tensor, cover: Tensor) -> Likeness | None:
     """How like a picture [H, W, 3] is to a photograph, both linear, where `cover` [H, W] is the
-    object; None where too little of it is.
+    object; None if too little of it is.
 
     The object is made smaller by EDGE, so that its silhouette does not count. Octave k is the
     difference of the grey values under Gaussians of 0.85 2^(k-1) and 0.85 2^k pixels: periods of
@@ -327,15 +327,15 @@ def measure_full_size(
 
 # By key: what the table says of it
 FULL_MEASURES = {
-    "full_psnr": "at full size: novel views, PSNR of the object after a gain per channel, dB",
-    "full_ssim": "at full size: SSIM",
+    "full_psnr": "full size: novel views, PSNR of the object, dB, a gain per channel",
+    "full_ssim": "full size: SSIM",
     **{
-        f"full_coherence_{k + 1}": f"at full size: coherence, octave {k + 1}"
+        f"full size: coherence, octave {k + 1}": f"at full size: coherence, octave {k + 1}"
         for k in range(OCTAVES)
     },
-    "full_model_psnr": "at full size, without photographs nearby: PSNR, dB",
+    "full_model_psnr": "full size, model only: PSNR, dB",
     **{
-        f"full_model_coherence_{k + 1}": f"at full size, without photographs nearby: octave {k + 1}"
+        f"full_model_coherence_{k + 1}": f"full size, model only: coherence, octave {k + 1}"
         for k in range(OCTAVES)
     },
 }

@@ -1,1 +1,1 @@
-"""A trained scene against the truth of its test views, and how sure it is without."""
+"""Metrics of a trained scene against ground truth, and its uncertainty without ground truth."""

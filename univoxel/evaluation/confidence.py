@@ -1,5 +1,5 @@
-"""What the photographs fix of a scene's materials, and what to photograph next: points of the
-surface, doubt anywhere, figures and words."""
+"""How well the photographs determine a scene's materials, and what to photograph next: points of
+the surface, uncertainty anywhere, figures and words."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from univoxel.sphere import fibonacci_sphere, gaps, side_of
 
 
 POINTS = 20_000  # of the surface that evaluation surveys, for its maps of doubt
-REPORT_POINTS = 2_000  # of the surface that are surveyed after training, for words alone
+REPORT_POINTS = 2_000  # of the surface that are surveyed after training, for words only
 
 # Observations of a point that are rendered again, at most
 OBSERVATIONS = 8
@@ -79,7 +79,7 @@ class Survey:
 
     @property
     def albedo(self) -> Tensor:
-        """Doubt of the albedo, in [0, 1]: 1 - seen * visibility * agreeing."""
+        """Uncertainty of the albedo, in [0, 1]: 1 - seen * visibility * agreeing."""
         seen = self.seen_with(self.straight)
         return torch.where(self.views > 0, 1 - seen * self.visibility * self.agreeing, 1.0)
 
@@ -94,24 +94,24 @@ class Survey:
 
     @property
     def roughness(self) -> Tensor:
-        """Doubt of the roughness, in [0, 1]: 1 - seen * visibility * agreeing * glossy.
+        """Uncertainty of the roughness, in [0, 1]: 1 - seen * visibility * agreeing * glossy.
 
-        glossy^2 is the share by which the photographs narrow what is known of roughness, its
-        variance, when before it could be anything in [0, 1].
+        glossy^2 is the share by which the photographs reduce the variance of the roughness, which
+        is uniform in [0, 1] before.
         """
         information = self.information
         return 1 - (1 - self.albedo) * (information / (1 + information)).sqrt()
 
     @property
     def information(self) -> Tensor:
-        """That photographs have of roughness, over that of knowing [0, 1] alone, whose variance is
+        """That photographs have of roughness, over that of knowing [0, 1] only, whose variance is
         1/12: each sRGB value has the noise NOISE."""
         return (self.gloss / NOISE).square() / 12
 
 
 @torch.no_grad()
 def survey(scene: Scene, photos: Photos, points: int) -> Survey:
-    """What the photographs that were trained on fix of points of the surface.
+    """How well the training photographs determine points of the surface.
 
     Args:
         points: how many, >= 1, spread evenly.
@@ -179,7 +179,7 @@ def compare(
     roughness_step: float,
 ) -> tuple[Tensor, Tensor]:
     """Mean absolute difference in sRGB of photographs and render, and root mean square of the
-    render's slope by roughness: [P] each, 0 where there is no observation.
+    render's slope by roughness: [P] each, 0 without an observation.
 
     A clipped pixel says only that it was at least so bright.
 
@@ -261,7 +261,7 @@ NEIGHBOURS = 4
 
 
 class Doubts:
-    """Doubts of a survey, to be looked up anywhere on the surface."""
+    """Uncertainty of a survey, which can be looked up anywhere on the surface."""
 
     def __init__(self, surveyed: Survey) -> None:
         self._scale = NORMAL_SCALE * surveyed.voxel_size
@@ -320,37 +320,37 @@ def numbers(surveyed: Survey) -> dict[str, float]:
 
 
 def words(figures: dict[str, float], troubles: list[str]) -> str:
-    """The figures as a paragraph, without what is not the case.
+    """The figures as a paragraph; findings that do not apply are left out.
 
     Args:
         troubles: what went wrong in training, from its state.
     """
     sentences = [
-        f"Doubt of albedo {figures['doubt_albedo']:.2f}, of roughness "
-        f"{figures['doubt_roughness']:.2f} in the mean over the surface (0: well determined, 1: a "
+        f"Uncertainty of the albedo {figures['doubt_albedo']:.2f}, of the roughness "
+        f"{figures['doubt_roughness']:.2f}, averaged over the surface (0: well determined, 1: a "
         "guess)."
     ]
     shares = {
         "few_views": f"is seen by fewer than {FEW_VIEWS} cameras: its materials are a guess",
-        "one_side": f"is seen from about one direction, within {ONE_SIDE:g} degrees of it: "
-        "colour and highlight are hard to tell apart there",
-        "clipped": "is clipped in most photographs: shorter exposures would help",
-        "black": "is black in most photographs: more light would help",
-        "shut": f"gets less than {MIN_VISIBILITY:.0%} of its light from outside: what parts of "
-        "the object send to each other may be left in its albedo",
-        "disagreeing": f"differs from its photographs by more than {MAX_DISAGREEMENT:g} in "
-        "sRGB: its surface, material or light is wrong",
-        "dull": "shows no highlight that tells its roughness",
+        "one_side": f"is seen only within {ONE_SIDE:g} degrees of one direction: colour and "
+        "highlight cannot be separated there",
+        "clipped": "is overexposed in most photographs: use shorter exposures",
+        "black": "is black in most photographs: use more light",
+        "shut": f"gets less than {MIN_VISIBILITY:.0%} of its light from outside: light reflected "
+        "between parts of the object may remain in its albedo",
+        "disagreeing": f"differs from its photographs by more than {MAX_DISAGREEMENT:g} in sRGB: "
+        "shape, material or light is wrong",
+        "dull": "shows no highlight, so its roughness is a guess",
     }
     for name, text in shares.items():
         if figures[name] >= MIN_SHARE:
             sentences.append(f"{figures[name]:.0%} of the surface {text}.")
     sentences.append(
-        "Albedo and light share a factor that photographs cannot fix: compare albedos with one "
-        "another, not with a colour chart."
+        "Photographs cannot separate the brightness of albedo and light: compare albedos with "
+        "one another, not with a colour chart."
     )
     if troubles:
-        sentences.append(f"Training met trouble {len(troubles)} times, the last in {troubles[-1]}.")
+        sentences.append(f"Training recovered {len(troubles)} times, last in {troubles[-1]}.")
     return " ".join(sentences)
 
 
@@ -381,17 +381,15 @@ COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", 
 class AdviceConfig:
     """How directions for more photographs are chosen."""
 
-    most: int = setting(6, "directions that are advised", least=1)
+    most: int = setting(6, "maximum number of directions", least=1)
     least: float = setting(
         0.006,
-        "worth of a photograph from which on it is advised: the share of the surface, times its "
-        "doubt, that it would show as well as many photographs",
+        "minimum worth of a photograph: the share of the surface, times its uncertainty, that "
+        "the photograph would resolve",
         least=0,
         most=1,
     )
-    share: float = setting(
-        0.5, "of the best one's worth; less is not worth the walk", least=0, most=1
-    )
+    share: float = setting(0.5, "minimum worth relative to the best photograph", least=0, most=1)
 
     __post_init__ = check_settings
 
@@ -438,7 +436,7 @@ def advise(
     Args:
         surveyed: what the photographs fix.
         cameras, names: of the photographs, V >= 1.
-        surface: what stands in the way.
+        surface: what is in the way.
     """
     low, high = surveyed.position.amin(0), surveyed.position.amax(0)
     middle = (low + high) / 2
@@ -485,7 +483,7 @@ def advise(
 
 
 def _shown(surveyed: Survey, surface: VisibilityScene, eye: Tensor) -> Tensor:
-    """Squared cosine [P] at which a camera sees points; 0 where it does not, as of `observe`."""
+    """Squared cosine [P] at which a camera sees points; 0 where it does not, as in `observe`."""
     towards = normalize(eye - surveyed.position, dim=1)
     cosine = (surveyed.normal * towards).sum(1)
     facing = (cosine > MIN_COSINE).nonzero()[:, 0]
@@ -500,7 +498,7 @@ def _shown(surveyed: Survey, surface: VisibilityScene, eye: Tensor) -> Tensor:
 
 def _agreeing(surveyed: Survey) -> Tensor:
     """`Survey.agreeing` [P] beside the best of the surface, in [0, 1]: what disagrees everywhere,
-    as after a short training, is mended by no photograph."""
+    as after a short training, is repaired by no photograph."""
     return (surveyed.agreeing / surveyed.agreeing.quantile(BEST)).clamp_max(1)
 
 

@@ -1,4 +1,4 @@
-"""The measures of a trained scene against the truth of its test views, and pictures of them."""
+"""Metrics of a trained scene against the ground truth of its test views, and images of them."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class Layers:
 
     rgb: Tensor  # [H, W, 3] physically based render
     albedo: Tensor  # [H, W, 3]
-    roughness: Tensor  # [H, W], 0 where nothing is
-    normal: Tensor  # [H, W, 3] world, 0 where nothing is
+    roughness: Tensor  # [H, W], 0 where there is nothing
+    normal: Tensor  # [H, W, 3] world, 0 where there is nothing
     alpha: Tensor  # [H, W]
-    depth: Tensor  # [H, W] along the camera's -Z, world units, 0 where nothing is
+    depth: Tensor  # [H, W] along the camera's -Z, world units, 0 where there is nothing
     relit: dict[str, Tensor]  # [H, W, 3] by map
     relit_scaled: dict[str, Tensor]  # the same with the scaled albedo
     doubt: Tensor | None = None  # [H, W, 2] in [0, 1] of albedo and roughness, 0 where nothing is
@@ -131,9 +131,9 @@ def _relight(relighting: Relighting, name: str, surface: Surface, wo: Tensor) ->
 # differs from photograph to photograph.
 
 
-STEPS = 100  # of Adam, as of NeRD (Boss et al. 2021) and Neural-PIL
+STEPS = 100  # of Adam, as in NeRD (Boss et al. 2021) and Neural-PIL
 RAYS = 2048  # of a step
-LR = 0.05, 0.005  # at begin and end, of log gains and of codes
+LR = 0.05, 0.005  # at the start and the end, of log gains and of codes
 
 
 def fit_light_(
@@ -145,7 +145,7 @@ def fit_light_(
     networks of light read.
 
     Args:
-        albedo_near: as of `render_layers`.
+        albedo_near: as in `render_layers`.
     """
     whole, wo = surface_of_view(scene, photos.cameras, view, albedo_near)
     color, alpha = photos.picture(view)
@@ -217,7 +217,7 @@ def expected_view(
     """The truth of one test view.
 
     Args:
-        relit: as of `SceneTruth`.
+        relit: as in `SceneTruth`.
         background: what the photograph is composited on.
 
     Raises:
@@ -254,8 +254,8 @@ def every_nth(photos: Photos, trained: list[str], every: int) -> Photos:
     chosen = sorted([*photos.names, *trained])[::every]
     if seen := sorted(set(chosen) & set(trained)):
         raise UserError(
-            f"test_every {every} asks for {len(seen)} photographs that were trained on, such as "
-            f"{seen[0]}: novel views are those that training has not seen",
+            f"test_every {every} selects {len(seen)} photographs that were trained on, such as "
+            f"{seen[0]}: test views must be photographs that training did not see",
             "test_every",
         )
     return photos.of(torch.tensor([photos.names.index(name) for name in chosen]))
@@ -278,12 +278,12 @@ def _check_size(photos: Photos, view: int, picture: Tensor, what: str) -> None:
     width, height = photos.cameras.size(view)
     if picture.shape != (height, width):
         raise DataError(
-            f"{photos.folder}: expected {what} to have {width}x{height} pixels like the test "
-            f"view, got {picture.shape[1]}x{picture.shape[0]}"
+            f"{photos.folder}: expected {what} with {width}x{height} pixels as in the test view, "
+            f"got {picture.shape[1]}x{picture.shape[0]}"
         )
 
 
-# The measures of a trained scene, and what decides on them.
+# The metrics of a trained scene, and their definitions.
 #
 # - albedo_psnr_raw, _1ch, _3ch: albedo as it is; with one scale; with a scale per channel. -
 # albedo_psnr_fg: as _3ch, over the pixels of the mask only. - relit_psnr: rendered with the albedo
@@ -294,21 +294,21 @@ def _check_size(photos: Photos, view: int, picture: Tensor, what: str) -> None:
 # difference in sRGB; of the   roughness, absolute difference.
 
 
-# By key: what the table says of it
+# Description of each key in the table
 MEASURES = {
     "nvs_psnr": "novel views, PSNR, dB",
     "nvs_ssim": "novel views, SSIM",
-    "albedo_psnr_raw": "albedo PSNR, dB, as it is",
+    "albedo_psnr_raw": "albedo PSNR, dB, unscaled",
     "albedo_psnr_1ch": "albedo PSNR, dB, one scale",
     "albedo_psnr_3ch": "albedo PSNR, dB, a scale per channel",
-    "albedo_psnr_fg": "albedo PSNR, dB, a scale per channel, mask only",
-    "roughness_mse": "roughness MSE in the mask",
+    "albedo_psnr_fg": "albedo PSNR, dB, a scale per channel, inside the mask",
+    "roughness_mse": "roughness MSE, inside the mask",
     "relit_psnr": "relit PSNR, dB, albedo with a scale per channel",
-    "relit_psnr_raw": "relit PSNR, dB, albedo as it is",
-    "normal_mae_deg": "normals, mean error in the mask, degrees",
+    "relit_psnr_raw": "relit PSNR, dB, albedo unscaled",
+    "normal_mae_deg": "normals, mean error inside the mask, degrees",
     "chamfer": "Chamfer distance, world units",
-    "trust_spearman": "rank correlation of the albedo's doubt with its error",
-    "trust_spearman_roughness": "rank correlation of the roughness's doubt with its error",
+    "trust_spearman": "rank correlation of albedo uncertainty and error",
+    "trust_spearman_roughness": "rank correlation of roughness uncertainty and error",
     "train_seconds": "training, seconds",
     "threads": "threads in training",
     "peak_rss_mb": "peak memory in training, MB",
@@ -388,7 +388,7 @@ def doubts_and_errors(layers: Layers, expected: Expected, scales: Scales) -> tup
 
 
 def doubt_correlation(pairs: list[Pairs]) -> float | None:
-    """Rank correlation of doubts and errors over all views; None where there is no truth."""
+    """Rank correlation of doubts and errors over all views; None if there is no truth."""
     known = [pair for pair in pairs if pair is not None]
     if not known:
         return None
@@ -397,12 +397,12 @@ def doubt_correlation(pairs: list[Pairs]) -> float | None:
 
 
 def albedo_scales(scene: Scene, photos: Photos, albedo_near: AlbedoNear | None = None) -> Scales:
-    """The scales over all test views, or 1 where there is no true albedo.
+    """The scales over all test views, or 1 if there is no true albedo.
 
     This is a pass of its own, so that the pass that renders keeps one view in memory.
 
     Args:
-        albedo_near: as of `render_layers`.
+        albedo_near: as in `render_layers`.
     """
     pairs = []
     for view in range(len(photos)):
@@ -419,7 +419,7 @@ def albedo_scales(scene: Scene, photos: Photos, albedo_near: AlbedoNear | None =
 
 
 def mesh_chamfer(mesh: Mesh | None, points: Tensor | None) -> float | None:
-    """Chamfer distance of samples of a mesh and points; None where there are none of either."""
+    """Chamfer distance of samples of a mesh and points; None if there are none of either."""
     if mesh is None or points is None or not len(mesh.faces):
         return None
     count = min(len(points), SURFACE_POINTS)

@@ -1,4 +1,4 @@
-"""The environment map that a scene recovered, and how far it is from the true one."""
+"""The recovered environment map of a scene, and its difference from the true one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from univoxel.sphere import fibonacci_sphere
 
 BLUR = math.radians(10.0)  # before the brightest direction is looked for: a light, not a texel
 NORMALS = 2048  # on the whole ball
-BALL = 200  # pixels of the mirror ball's diameter
+BALL = 200  # pixels of the chrome sphere's diameter
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Comparison:
 
     ball_psnr: float  # dB, sRGB of a grey ball seen from everywhere, brightest 1 under the truth
     brightest_degrees: float  # between the brightest directions
-    mirror_psnr: float  # dB, sRGB of a mirror ball seen from +X, as the picture has it
+    mirror_psnr: float  # dB, sRGB of a chrome sphere seen from +X, as the picture has it
 
 
 @torch.no_grad()
@@ -43,8 +43,8 @@ def recovered_map(scene: Scene, run: Path, height: int) -> Tensor:
     sky = scene.environment()
     if sky is None:
         raise UserError(
-            f"{run}: this run has no environment map: it was trained with {scene.cfg.light.kind} "
-            "light alone"
+            f"{run}: this run has no environment map: it was trained with local light "
+            f"({scene.cfg.light.kind}) only"
         )
     return scene.exposed(sky.latlong(height))
 
@@ -79,7 +79,7 @@ def brightest(map: Tensor) -> Tensor:
 
 
 def scale_to(recovered: Tensor, true: Tensor) -> Tensor:
-    """The factor [3] that brings the grey ball's light to the true one."""
+    """The factor [3] that brings the diffuse sphere's light to the true one."""
     normal = fibonacci_sphere(NORMALS)
     truth, ball = grey_ball(true, normal), grey_ball(recovered, normal)
     return metrics.albedo_scale(truth, ball, torch.ones(NORMALS, dtype=torch.bool))

@@ -1,4 +1,4 @@
-"""Test views as a scene renders them against their truth: measures, pictures, and what is weak."""
+"""Test views of a scene against their ground truth: metrics, images, uncertainty."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def measure_views(
     Args:
         background: what novel views are compared with photographs on.
         fit_light: each is rendered in the light that fits its photograph.
-        albedo_near: as of `render_layers`.
+        albedo_near: as in `render_layers`.
     """
     doubts = Doubts(surveyed) if surveyed else None
     found = ViewMeasures({key: [] for key in MEASURES}, [], [])
@@ -149,11 +149,11 @@ def panels_of_view(layers: Layers, expected: Expected, scales: Scales) -> list[P
             " degrees",
         ),
     ]
-    if layers.doubt is not None:  # beside what it should foretell
+    if layers.doubt is not None:  # beside the error that it should predict
         albedo, rough = (torch.from_numpy(heat(x, 1.0)) for x in layers.doubt.unbind(-1))
-        heads = ("roughness doubt", "albedo error")
+        heads = ("roughness uncertainty", "albedo error")
         error = panels[1].error
-        panels.append(Panel("albedo doubt", albedo, rough, error, COLOR_LIMIT, heads=heads))
+        panels.append(Panel("albedo uncertainty", albedo, rough, error, COLOR_LIMIT, heads=heads))
     panels += [
         colors(f"under {name}", layers.relit_scaled[name], photo)
         for name, photo in expected.relit.items()
@@ -166,19 +166,19 @@ def survey_of(scene: Scene, run: Path, data: Path | None) -> Survey | None:
     try:
         return survey(scene, photos_of(run, data, "train"), POINTS)
     except UserError as error:  # no photographs to train on, or no surface
-        log.info("no trust report: %s", error, extra={"arguments": error.arguments})
+        log.info("no uncertainty report: %s", error, extra={"arguments": error.arguments})
         return None
 
 
 def say_trust(
     surveyed: Survey | None, troubles: list[str], save: Path | None
 ) -> dict[str, dict[str, float]]:
-    """Say what is weakly determined, and write it to `save`; its figures under the key trust."""
+    """Log the uncertainty, and write it to `save`; return its figures under the key trust."""
     if surveyed is None:
         return {}
     figures = numbers(surveyed)
     paragraph = words(figures, troubles)
-    log.info(paragraph)
+    log.debug(paragraph)
     if save:
         write_text(save / "trust.txt", paragraph + "\n")
     return {"trust": figures}

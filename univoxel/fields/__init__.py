@@ -1,1 +1,1 @@
-"""What a point of space is: distances, features, and the heads that decode them."""
+"""Properties of points in space: distances, features, and the networks that decode them."""

@@ -1,4 +1,4 @@
-"""A sparse grid of signed distances: bricks around the surface, and far distance elsewhere."""
+"""A sparse grid of signed distances: bricks around the surface, far distances elsewhere."""
 
 from __future__ import annotations
 

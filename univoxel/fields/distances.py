@@ -1,5 +1,4 @@
-"""What every grid of signed distances offers, the dense one, and how a finished scene stores
-them."""
+"""Grids of signed distances: the common interface, the dense grid, and compact storage."""
 
 from __future__ import annotations
 
@@ -33,7 +32,7 @@ MIN_SHARE = 0.05
 class SurfaceVersion:
     """Which state an sdf is in, told without reading it.
 
-    Notices other memory, as of another grid or after `sdf.data = ...`, and what torch counts:
+    Notices other memory, as in another grid or after `sdf.data = ...`, and what torch counts:
     every change in place of the parameter or of `sdf.detach()`. Changes in place of `sdf.data` are
     the only ones that nobody counts.
     """

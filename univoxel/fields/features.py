@@ -46,7 +46,7 @@ class AbstractFeatures(nn.Module, ABC):
     def at(
         self, distances: AbstractDistances, points: Tensor, values: Tensor | None = None
     ) -> Tensor:
-        """The features [M, C] alone: no gradient to the sdf, not even one of zeros.
+        """The features [M, C] only: no gradient to the sdf, not even one of zeros.
 
         Args:
             values: read in place of its own.

@@ -1,5 +1,4 @@
-"""A field: signed distances and features everywhere in a box, and the small networks that decode
-them."""
+"""A field: signed distances and features inside a box, and the small networks that decode them."""
 
 from __future__ import annotations
 
@@ -69,7 +68,7 @@ class RadianceHead(nn.Module):
     def __init__(self, channels: int, hidden: int, levels: int = 0) -> None:
         """
         Args:
-            levels: of the table of mirrored directions, >= 0.
+            levels: of the table of reflected directions, >= 0.
         """
         super().__init__()
         self.directions: DirectionTable = DirectionTable(levels)
@@ -153,7 +152,7 @@ class Field(nn.Module):
         return self.encoding.sample(self.distances, points)
 
     def features_at(self, points: Tensor, values: Tensor | None = None) -> Tensor:
-        """The features [M, C] alone: no gradient to the sdf, not even one of zeros.
+        """The features [M, C] only: no gradient to the sdf, not even one of zeros.
 
         Args:
             values: as `features`, read in their place.

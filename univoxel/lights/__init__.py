@@ -1,4 +1,4 @@
-"""Lights: each says what falls on a surface point and what the point reflects."""
+"""Lighting models: the light that reaches a surface point, and what the point reflects."""
 
 from __future__ import annotations
 

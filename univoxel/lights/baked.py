@@ -1,4 +1,4 @@
-"""No model of light at all: what photographs show is taken for albedo."""
+"""No lighting model: the colours of the photographs are used as albedo."""
 
 from __future__ import annotations
 

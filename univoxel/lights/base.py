@@ -1,5 +1,4 @@
-"""The interface of all lights, what is likely of them, and what those share that vary over the
-surface."""
+"""The interface of all lighting models, their regularisation, and a base for local light."""
 
 from __future__ import annotations
 
@@ -57,12 +56,12 @@ def total_variation(log_map: Tensor) -> Tensor:
 MOST_DIRECTIONS = 1 << 16  # that light is summed up over: memory of a batch grows with them
 MOST_LAYERS = 32  # of a network: without shortcuts deeper ones do not learn
 MOST_ROWS = 1 << 13  # of a map
-KIND = about("name of this light, by which config.json tells it from the others")
+KIND = about("name of the lighting model in config.json")
 
 
 @dataclass(frozen=True)
 class Regularisation:
-    """What keeps a light likely: terms [] >= 0, None where the light has no such term.
+    """What keeps a light likely: terms [] >= 0, None if the light has no such term.
 
     Each is weighted by the field of LossConfig of its name.
     """
@@ -90,7 +89,7 @@ class AbstractLight(nn.Module, ABC):
     ) -> Tensor:
         """Linear radiance [N, D, 3] >= 0 that arrives at N points from unit world directions wi.
 
-        Nothing stands in the way of a light that is traced.
+        Nothing is in the way of a light that is traced.
         """
 
     @abstractmethod
@@ -171,12 +170,12 @@ def encode(surface: Surface, scale: float) -> Tensor:
 # Light that is finer than the lobes of a local light, as a surface mirrors it.
 
 
-_OCTAVES = 4  # of the mirrored direction: sines of 1, 2, 4, 8 radians
+_OCTAVES = 4  # of the reflected direction: sines of 1, 2, 4, 8 radians
 
 
 class MirroredLight(nn.Module):
-    """What the mirrored direction holds beyond a local light's lobes: E(n.wo, roughness) times a
-    network of place, roughness and mirrored direction.
+    """What the reflected direction holds beyond a local light's lobes: E(n.wo, roughness) times a
+    network of place, roughness and reflected direction.
 
     Lobes and quadratures blur what a smooth surface mirrors sharply. The split sum (Karis 2013,
     Real Shading in Unreal Engine 4) asks for one blurred radiance a point instead, which a network
@@ -213,7 +212,7 @@ class MirroredLight(nn.Module):
         """Radiance [N, 3] towards unit directions wo [N, 3], to be added.
 
         Args:
-            table: of mirrored directions, with `known` channels; another network's too.
+            table: of reflected directions, with `known` channels; another network's too.
         """
         cosine = (surface.normal * wo).sum(1, keepdim=True)
         mirrored = 2 * cosine * surface.normal - wo

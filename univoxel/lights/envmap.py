@@ -27,9 +27,9 @@ class EnvmapConfig(LatLongConfig):
     """An environment map of texels, with traced visibility."""
 
     kind: Literal["envmap"] = field(default="envmap", init=False, metadata=KIND)
-    rows: int = setting(256, "of the map, twice as wide", least=1, most=MOST_ROWS)
-    directions: int = setting(64, "of the half-sphere, in training", least=1, most=MOST_DIRECTIONS)
-    directions_eval: int = setting(256, "in evaluation", least=1, most=MOST_DIRECTIONS)
+    rows: int = setting(256, "rows of the map", least=1, most=MOST_ROWS)
+    directions: int = setting(64, "directions in training", least=1, most=MOST_DIRECTIONS)
+    directions_eval: int = setting(256, "directions in evaluation", least=1, most=MOST_DIRECTIONS)
 
     __post_init__ = check_settings
 
@@ -74,8 +74,7 @@ class EnvmapLight(AbstractLatLongLight):
     def regularisation(self, surface: Surface, near: Surface) -> Regularisation:
         log_map = self.log_radiance
         return Regularisation(
-            map_smoothness=base.total_variation(log_map),
-            white_light=latlong.chroma(log_map.exp()),
+            map_smoothness=base.total_variation(log_map), white_light=latlong.chroma(log_map.exp())
         )
 
     def latlong(self, height: int) -> Tensor:
@@ -96,15 +95,15 @@ class EnvmapSGConfig(LatLongConfig):
     """An environment map of spherical Gaussians, with traced visibility."""
 
     kind: Literal["envmap-sg"] = field(default="envmap-sg", init=False, metadata=KIND)
-    lobes: int = setting(128, "of the map", least=1)
+    lobes: int = setting(128, "number of lobes", least=1)
     max_sharpness: float = setting(
-        100.0, "of a lobe; its half width is about sqrt(2 / sharpness) rad", above=0
+        100.0, "sharpness of a lobe; its half width is about sqrt(2 / sharpness) rad", above=0
     )
     rows: int = setting(
-        64, "of the lat-long map that the lobes are summed on", least=1, most=MOST_ROWS
+        64, "rows of the lat-long map that the lobes are rendered to", least=1, most=MOST_ROWS
     )
-    directions: int = setting(64, "of the half-sphere, in training", least=1, most=MOST_DIRECTIONS)
-    directions_eval: int = setting(256, "in evaluation", least=1, most=MOST_DIRECTIONS)
+    directions: int = setting(64, "directions in training", least=1, most=MOST_DIRECTIONS)
+    directions_eval: int = setting(256, "directions in evaluation", least=1, most=MOST_DIRECTIONS)
 
     __post_init__ = check_settings
 

@@ -1,5 +1,4 @@
-"""One distant light on a lat-long map: what such lights share, and the map at nodes that is
-solved for."""
+"""Distant light on a lat-long map: the common base, and a map on nodes that is solved for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Light as a network of place and direction."""
+"""Local light as a network of position and direction."""
 
 from __future__ import annotations
 
@@ -35,16 +35,14 @@ class MLPLightConfig(LocalLightConfig):
 
     kind: Literal["mlp"] = field(default="mlp", init=False, metadata=KIND)
     rank: int = setting(
-        32, "functions of direction that a point's light is put together of", least=1
+        32, "basis functions of direction that a point's light is composed of", least=1
     )
     hidden: int = setting(64, "width of both networks", least=1)
-    layers: int = setting(2, "hidden layers of both", least=0, most=MOST_LAYERS)
-    frequencies: int = setting(3, "of the direction: sines of 1, 2, 4 times its parts", least=0)
-    directions: int = setting(
-        256, "over the whole sphere, in training", least=1, most=MOST_DIRECTIONS
-    )
-    directions_eval: int = setting(512, "in evaluation", least=1, most=MOST_DIRECTIONS)
-    scale: float = setting(1.0, "half the extent of what is lit", unit="world units", above=0)
+    layers: int = setting(2, "hidden layers of both networks", least=0, most=MOST_LAYERS)
+    frequencies: int = setting(3, "frequencies of the direction's encoding", least=0)
+    directions: int = setting(256, "directions in training", least=1, most=MOST_DIRECTIONS)
+    directions_eval: int = setting(512, "directions in evaluation", least=1, most=MOST_DIRECTIONS)
+    scale: float = setting(1.0, "half the extent of the lit region", unit="world units", above=0)
 
     __post_init__ = check_settings
 
@@ -121,6 +119,5 @@ class LocalMLP(AbstractLocalLight):
         wi = sphere.fibonacci_sphere(_MEAN_OVER).to(here)
         light = nn.functional.softplus(self.basis(wi) @ here)
         return Regularisation(
-            light_smoothness=base.smoothness(here, beside),
-            white_light=base.chroma(light.mean(1)),
+            light_smoothness=base.smoothness(here, beside), white_light=base.chroma(light.mean(1))
         )

@@ -1,4 +1,4 @@
-"""Reflection of any light, by quadrature over the half-sphere or the sphere."""
+"""Reflection of any light by quadrature over the hemisphere or the sphere."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def reflected(
             if shape != wanted:
                 raise ValueError(f"reflected: {name} must be {list(wanted)}, got {list(shape)}")
         if generator is not None:
-            raise ValueError("reflected: an occlusion has its own directions, got a generator too")
+            raise ValueError("reflected: expected an occlusion or a generator, got both")
     rotation = rotations(surface, generator) if occlusion is None else occlusion.rotation
     wi = half_sphere(surface, directions, rotation)
     radiance = light.incident(surface, wi)

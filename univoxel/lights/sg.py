@@ -1,4 +1,4 @@
-"""Light as spherical Gaussians that vary over the surface."""
+"""Local light as spherical Gaussians."""
 
 from __future__ import annotations
 
@@ -63,17 +63,15 @@ class SGConfig(LocalLightConfig):
     """Local spherical Gaussian light."""
 
     kind: Literal["sg"] = field(default="sg", init=False, metadata=KIND)
-    lobes: int = setting(16, "a point", least=1)
+    lobes: int = setting(16, "lobes per point", least=1)
     hidden: int = setting(64, "width of the head", least=1)
     layers: int = setting(2, "hidden layers of the head", least=0, most=MOST_LAYERS)
-    directions: int = setting(64, "of the quadrature in training", least=1, most=MOST_DIRECTIONS)
-    directions_eval: int = setting(
-        256, "of the quadrature in evaluation", least=1, most=MOST_DIRECTIONS
-    )
+    directions: int = setting(64, "directions in training", least=1, most=MOST_DIRECTIONS)
+    directions_eval: int = setting(256, "directions in evaluation", least=1, most=MOST_DIRECTIONS)
     max_sharpness: float = setting(
-        30.0, "of a lobe; its half width is about sqrt(2 / sharpness) rad", above=0
+        30.0, "sharpness of a lobe; its half width is about sqrt(2 / sharpness) rad", above=0
     )
-    scale: float = setting(1.0, "half the extent of what is lit", unit="world units", above=0)
+    scale: float = setting(1.0, "half the extent of the lit region", unit="world units", above=0)
 
     __post_init__ = check_settings
 

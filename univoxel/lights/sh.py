@@ -1,4 +1,4 @@
-"""Light as spherical harmonics that vary over the surface."""
+"""Local light as spherical harmonics."""
 
 from __future__ import annotations
 
@@ -34,14 +34,12 @@ class SHConfig(LocalLightConfig):
     """Local light in spherical harmonics."""
 
     kind: Literal["sh"] = field(default="sh", init=False, metadata=KIND)
-    order: int = setting(3, "the highest degree: 3 (order + 1)^2 numbers a point", least=0)
+    order: int = setting(3, "highest degree: 3 (order + 1)^2 numbers per point", least=0)
     hidden: int = setting(64, "width of the head", least=1)
     layers: int = setting(2, "hidden layers of the head", least=0, most=MOST_LAYERS)
-    directions: int = setting(
-        256, "over the whole sphere, in training", least=1, most=MOST_DIRECTIONS
-    )
-    directions_eval: int = setting(512, "in evaluation", least=1, most=MOST_DIRECTIONS)
-    scale: float = setting(1.0, "half the extent of what is lit", unit="world units", above=0)
+    directions: int = setting(256, "directions in training", least=1, most=MOST_DIRECTIONS)
+    directions_eval: int = setting(512, "directions in evaluation", least=1, most=MOST_DIRECTIONS)
+    scale: float = setting(1.0, "half the extent of the lit region", unit="world units", above=0)
 
     __post_init__ = check_settings
 
@@ -110,6 +108,5 @@ class LocalSH(AbstractLocalLight):
         wi = sphere.fibonacci_sphere(_MEAN_OVER).to(here)
         light = nn.functional.softplus(sphere.real_harmonics(self.config.order, wi) @ here)
         return Regularisation(
-            light_smoothness=base.smoothness(here, beside),
-            white_light=base.chroma(light.mean(1)),
+            light_smoothness=base.smoothness(here, beside), white_light=base.chroma(light.mean(1))
         )

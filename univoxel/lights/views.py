@@ -1,5 +1,4 @@
-"""What the light of each photograph has of its own: a gain, a flash, or where the whole light
-turns with the camera."""
+"""Light that depends on the photograph: a gain, a flash, or light that turns with the camera."""
 
 from __future__ import annotations
 
@@ -51,7 +50,7 @@ class ViewLights(nn.Module):
         """
         Args:
             names: of the V views, in the order of their numbers.
-            codes: Z, >= 0; 0: the views differ by gains alone.
+            codes: Z, >= 0; 0: the views differ by gains only.
             directions: [D, 3] unit, of the scene's map, where it may differ from view to view.
             generator: draws the first codes.
         """
@@ -119,7 +118,7 @@ class ViewLights(nn.Module):
         return self.log_gain[view].exp()
 
     def code(self, view: Tensor | int | None = None) -> Tensor | None:
-        """[N, Z] of views [N]; [Z] for one view, or none. None where only gains differ."""
+        """[N, Z] of views [N]; [Z] for one view, or none. None if only gains differ."""
         if self.raw_codes is None:
             return None
         view = self.chosen if view is None else view
@@ -130,7 +129,7 @@ class ViewLights(nn.Module):
         return codes[view]
 
     def sky_change(self) -> Tensor | None:
-        """What each view adds to the log map: [V, D, 3]; None where all have one map."""
+        """What each view adds to the log map: [V, D, 3]; None if all have one map."""
         if self.sky_weights is None or self.sky_basis is None:
             return None
         return torch.einsum("vrc,rd->vdc", _centred(self.sky_weights), self.sky_basis)
@@ -201,11 +200,11 @@ PAIRS = 500  # of cameras, whose axes are tried
 class Table:
     """The axis about which an object was turned, while camera and light stood still."""
 
-    point: Vec3 = field(metadata=about("of the axis", unit="world units"))
-    axis: Vec3 = field(metadata=about("unit, upwards"))
-    start: Vec3 = field(metadata=about("unit, across the axis: from it to the camera"))
+    point: Vec3 = field(metadata=about("a point of the axis", unit="world units"))
+    axis: Vec3 = field(metadata=about("unit vector, pointing up"))
+    start: Vec3 = field(metadata=about("unit vector from the axis to the camera"))
     eyes: tuple[Vec3, ...] = setting(
-        (), "where its cameras stood; none: all stood around this axis"
+        (), "positions of its cameras; empty: all stood around this axis"
     )
 
     def __post_init__(self) -> None:
@@ -213,8 +212,8 @@ class Table:
         lengths = float((axis.norm() - 1).abs().maximum((start.norm() - 1).abs()))
         if not max(lengths, float((axis @ start).abs())) < 1e-3:
             raise ConfigError(
-                f"{type(self).__name__}: axis and start must be unit vectors across each other, "
-                f"got {self.axis} and {self.start}"
+                f"{type(self).__name__}: axis and start must be perpendicular unit vectors, got "
+                f"{self.axis} and {self.start}"
             )
 
     @staticmethod
@@ -252,11 +251,11 @@ class Turntable(Table):
     """How an object was turned before a camera and a light that stood still.
 
     In the world, which is the object's, the light turns about the axis as the camera does. Its own
-    frame is the world as it was when the camera stood at `start`. An object that was laid anew, to
+    frame is the world as it was when the camera stood at `start`. An object that was laid again, to
     show its underside, has another axis for the photographs since then.
     """
 
-    others: tuple[Table, ...] = setting((), "each with the eyes of its own cameras")
+    others: tuple[Table, ...] = setting((), "other tables, each with its own eyes")
 
     def __post_init__(self) -> None:
         super().__post_init__()

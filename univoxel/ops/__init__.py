@@ -1,4 +1,4 @@
-"""Differentiable torch ops over native CPU kernels, each beside its eager reference."""
+"""Differentiable PyTorch ops with native CPU kernels and an eager reference for each."""
 
 from univoxel.ops.compositing import (
     FieldAlongRays,

@@ -1,4 +1,4 @@
-"""Charts of a mesh: where each of its triangles lies in a texture."""
+"""Charts of a mesh: the place of each triangle in a texture."""
 
 from __future__ import annotations
 

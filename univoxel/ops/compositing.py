@@ -1,5 +1,5 @@
-"""Volume rendering of packed rays: opacity from signed distances, compositing, and a field
-sampled and composited in one pass."""
+"""Volume rendering of packed rays: opacity from signed distances, compositing, and a fused op that
+samples and composites a field."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def composite(
 def composite_reference(
     alpha: Tensor, value: Tensor, offsets: Tensor, early_stop: float = 0.0
 ) -> tuple[Tensor, Tensor]:
-    """The same in eager torch: rays padded to the longest, autograd gives the backward."""
+    """Reference in eager PyTorch: rays padded to the longest, autograd gives the backward."""
     counts = offsets.diff()
     ray = torch.repeat_interleave(counts)
     slot = torch.arange(len(alpha), device=alpha.device) - offsets[ray]
@@ -118,7 +118,7 @@ def _composite(
 # A field composited along packed rays: sampling, opacity and compositing in one pass.
 
 
-# Lower and upper corner and voxel sizes of a hash table's levels, as of `encode_hash`
+# Lower and upper corner and voxel sizes of a hash table's levels, as in `encode_hash`
 Lattices: TypeAlias = "tuple[Sequence[float], Sequence[float], Sequence[float]]"
 RAY_NUMBERS = 5  # of a ray before its features: opacity, t, gradient
 SAMPLE_NUMBERS = 4  # of a held sample before its features: sdf, gradient
@@ -148,7 +148,7 @@ def composite_field(
     min_share: float = 0.0,
     sparse_grad: bool = False,
 ) -> FieldAlongRays:
-    """Sample a field along packed rays and composite what it says, front to back.
+    """Sample a field along packed rays and composite it, front to back.
 
     At the samples x_i = origin + t_i direction of a ray, the field has distances f_i, gradients and
     features as `sample_dense` (with bricks `sample_sparse`) and `encode_hash` define them. From i
@@ -166,15 +166,15 @@ def composite_field(
 
     Args:
         sdf: [X, Y, Z] world units, negative inside; with bricks [R].
-        features: [X, Y, Z, C], with bricks [R, C]; with levels [L * rows, F] as of `encode_hash`,
+        features: [X, Y, Z, C], with bricks [R, C]; with levels [L * rows, F] as in `encode_hash`,
             and then C = L F.
         origin, direction: [N, 3] rays in the world.
-        samples: packed along them, as of `march`.
+        samples: packed along them, as in `march`.
         grid_origin: world position of node (0, 0, 0).
         voxel_size: world units, above 0.
         inv_s: 1 / s, sharpness of the density, 1 / world units, above 0.
         bricks: of a sparse grid.
-        levels: lower and upper corner and voxel sizes of a hash table, as of `encode_hash`.
+        levels: lower and upper corner and voxel sizes of a hash table, as in `encode_hash`.
         min_share: in [0, 1), of a ray's heaviest sample. Of samples with less only the distance is
             read: features and gradients are then the mean of the others, times the opacity.
         sparse_grad: gradients of sdf and features come back as coalesced ``sparse_coo`` tensors of
@@ -283,7 +283,7 @@ def composite_field_reference(
     levels: Lattices | None = None,
     min_share: float = 0.0,
 ) -> Tensor:
-    """The same in eager torch, op by op: opacity, t, gradient and features, [N, 5 + C]."""
+    """Reference in eager PyTorch, op by op: opacity, t, gradient and features, [N, 5 + C]."""
     ray = torch.repeat_interleave(samples.offsets.diff())
     points = origin[ray] + samples.t[:, None] * direction[ray]
     of_nodes = features if levels is None else sdf.new_empty(*sdf.shape, 0)

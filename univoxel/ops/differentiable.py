@@ -1,5 +1,4 @@
-"""Ops with gradients, declared once and registered with torch in full, and one check for the
-arguments of every op."""
+"""Declaration of ops with gradients and their registration with torch; checks of arguments."""
 
 from __future__ import annotations
 
@@ -26,7 +25,7 @@ def check(
     of the same dtype as the other floating ones. All share one device.
 
     Raises:
-        TypeError: an argument is no tensor.
+        TypeError: an argument is not a tensor.
         ValueError: a size, dtype or device is off; the message says what was wanted and what came.
     """
     sizes: dict[str, int] = {}
@@ -142,11 +141,11 @@ def differentiable(
         forward: calls the kernel, where it takes its arguments in another order.
         backward: likewise. If the op has an option `sparse_grad` and it is true, backward is called
             without an op: sizes of gradients may then depend on values.
-        held: how many outputs, the last ones, serve the backward pass alone. They have no gradient
+        held: how many outputs, the last ones, serve the backward pass only. They have no gradient
             and are saved after the tensors.
         optional: those of `to` whose gradient is an empty array where it is not needed. The kernel
             computes the others always.
-        traced: backward is made of torch's operations and is no op. It takes what is held alone.
+        traced: backward is made of torch's operations and is no op. It takes what is held only.
     """
     return lambda allocate: Differentiable(
         name or allocate.__name__.removeprefix("_"),
@@ -356,8 +355,8 @@ class _Once(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:
         raise RuntimeError(
-            f"{ctx.name}: cannot differentiate twice: gradients of this op have none themselves, "
-            'those of its reference have: univoxel.ops.use_backend("reference")'
+            f"{ctx.name}: cannot differentiate twice: this op has no second derivatives, but its "
+            'reference does: univoxel.ops.use_backend("reference")'
         )
 
 

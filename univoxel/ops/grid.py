@@ -1,5 +1,5 @@
-"""Sampling of dense grids, and of grids of which only bricks around a surface are stored:
-distance, its spatial gradient and features at points."""
+"""Sampling of dense grids, and of sparse grids stored in bricks: distance, its spatial gradient and
+features at points."""
 
 from __future__ import annotations
 
@@ -67,10 +67,10 @@ def gradients(
     needs: list[bool],
     sparse: bool,
 ) -> list[Tensor | None]:
-    """Gradients to sdf, features and points; None where not needed.
+    """Gradients to sdf, features and points; None if not needed.
 
     Args:
-        sparse: those to sdf and features hold touched rows alone.
+        sparse: those to sdf and features hold touched rows only.
     """
     sdf, features, points, order = inputs
     core, threads = native.require(), native.threads()
@@ -222,7 +222,7 @@ def sample_dense(
 def sample_dense_reference(
     sdf: Tensor, features: Tensor, points: Tensor, origin: Sequence[float], voxel_size: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The same in eager torch: eight corners, each with its six neighbours."""
+    """Reference in eager PyTorch: eight corners, each with its six neighbours."""
     size = torch.tensor(sdf.shape, device=sdf.device)
     lost = points.isnan().any(1, keepdim=True)
     start = torch.tensor(origin, dtype=torch.float64, device=sdf.device)
@@ -281,7 +281,7 @@ def sample_sparse(
         value [M], world units; gradient [M, 3], no unit; feature [M, C].
 
     Raises:
-        TypeError, ValueError: an argument is no tensor or no Bricks, or of another size, dtype or
+        TypeError, ValueError: an argument is not a tensor or Bricks, or has another size, dtype or
             device than above; the grid has no nodes; origin or voxel_size out of range.
 
     Differentiable in: sdf, features, points. Second order raises.
@@ -318,7 +318,7 @@ def sample_sparse_reference(
     origin: Sequence[float],
     voxel_size: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The same in eager torch, over the whole grid."""
+    """Reference in eager PyTorch, over the whole grid."""
     rows = bricks.grid_rows()
     stored = rows >= Bricks.MISSING * Bricks.NODES
     whole = torch.where(stored, sdf[rows], sdf.detach()[rows])

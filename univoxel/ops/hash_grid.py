@@ -119,7 +119,7 @@ def encode_hash_reference(
     voxel_sizes: Sequence[float],
     felt: int | None = None,
 ) -> Tensor:
-    """The same in eager torch: level by level, corner by corner."""
+    """Reference in eager PyTorch: level by level, corner by corner."""
     rows = len(table) // len(voxel_sizes)
     lost = points.isnan().any(1, keepdim=True)
     points = torch.where(lost, 0.0, points)
@@ -208,11 +208,11 @@ def gradients(
     needs: list[bool],
     sparse: bool,
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Gradients to table and points; None where not needed.
+    """Gradients to table and points; None if not needed.
 
     Args:
         place: as the extension takes it.
-        sparse: that to the table holds touched rows alone.
+        sparse: that to the table holds touched rows only.
     """
     touched = rows = of_table = None
     if needs[0] and sparse:

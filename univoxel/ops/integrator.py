@@ -1,4 +1,4 @@
-"""Light that points of a surface send to the eye under an environment map, by path tracing."""
+"""Radiance that surface points send to the eye under an environment map, by path tracing."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Sun:
-    """A disc of even light far away.
+    """A distant disc of uniform light.
 
     Raises:
         ValueError: a number is not finite, the direction has no length, the irradiance is below 0,
@@ -61,7 +61,7 @@ class Sun:
 
 @dataclass(frozen=True)
 class PointLight:
-    """A point that shines evenly all around; irradiance falls with the distance squared.
+    """A point that emits uniformly; irradiance falls with the squared distance.
 
     Raises:
         ValueError: a number is not finite, or the intensity is below 0.
@@ -97,11 +97,11 @@ def relight(
     seed: int = 0,
     strategy: Strategy = "mis",
 ) -> Tensor:
-    """Radiance that surface points send along wo under an environment map and other lights.
+    """Path-traced radiance of surface points along wo, under an environment map and other lights.
 
         L(wo) = integral over the half-sphere of f(wi, wo) L_i(wi) (n.wi) dwi
 
-    L_i is the light where nothing stands in the way, else what the mesh sends back, up to `bounces`
+    L_i is the light where nothing is in the way, else what the mesh sends back, up to `bounces`
     times. Every vertex of a path sends a shadow ray to each sun and point light. It samples one
     direction of the map in proportion to its light and one of the BRDF, weighed by the power
     heuristic. The points are Sobol's sequence with an Owen scramble of its own per surface point.
@@ -131,7 +131,7 @@ def relight(
         first: number of the first sample in the sequence, >= 0: the mean of samples 0 .. 63 is that
             of 0 .. 31 and 32 .. 63.
         seed: another seed, other noise; in 0 .. 2^32 - 1.
-        strategy: "map" or "brdf" draws from one of the two alone: the same mean, more noise.
+        strategy: "map" or "brdf" draws from one of the two only: the same mean, more noise.
 
     Returns:
         [N, 3] float32 linear, finite: a point with no normal, or with anything that is not finite,

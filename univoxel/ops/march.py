@@ -1,4 +1,4 @@
-"""Marching rays through an SDF grid: where along each ray is there something to see."""
+"""Ray marching through an SDF grid: finds the samples with visible density."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def brick_minimum(sdf: Tensor, bricks: Bricks | None = None) -> Tensor:
         that are missing outside or stand nowhere, minus infinity for those missing inside.
 
     Raises:
-        TypeError, ValueError: an argument of another size, dtype or device than above.
+        TypeError, ValueError: an argument has another size, dtype or device than above.
     """
     if bricks is not None:
         return _sparse_brick_minimum(sdf, bricks)
@@ -84,7 +84,7 @@ def march(
     early_stop: float = 1e-3,
     bricks: Bricks | None = None,
 ) -> Samples:
-    """Samples along rays where the NeuS density of an SDF grid lets anything be seen.
+    """Samples along rays where the NeuS density of an SDF grid is visible.
 
     Samples stand at t = near + (k + jitter) step inside the grid's box. A section between two of
     them is kept when it weighs more than min_weight, with
@@ -109,7 +109,7 @@ def march(
         bricks: of a sparse grid. Those that are missing outside are skipped.
 
     Raises:
-        TypeError, ValueError: an argument of another size, dtype, device or range than above.
+        TypeError, ValueError: an argument has another size, dtype, device or range than above.
 
     Not differentiable. Source: Wang et al. 2021 (NeuS), eq. 13.
     """
@@ -190,7 +190,7 @@ def march_reference(
     min_weight: float = 1e-4,
     early_stop: float = 1e-3,
 ) -> Samples:
-    """The same in eager torch, without skipping: every sample of every ray at once."""
+    """Reference in eager PyTorch, without skipping: every sample of every ray at once."""
     start = origin.new_tensor(grid_origin)
     size = torch.tensor(sdf.shape, device=sdf.device, dtype=sdf.dtype) - 1
     o, d = (origin - start) / voxel_size, direction / voxel_size

@@ -1,4 +1,4 @@
-"""The door to the compiled kernels: which build is loaded, when it serves, on how many threads.
+"""Loading of the compiled kernels: which build is used, for which tensors, on how many threads.
 
 Nothing outside ``univoxel.ops`` imports the extension.
 """
@@ -52,9 +52,9 @@ class NativeStatus:
 
 
 def native_status() -> NativeStatus:
-    """Return what is known of the compiled extension: whether it serves, and if not, why.
+    """The status of the compiled extension: whether it is loaded, and if not, why.
 
-    Without it, ops run in eager torch, and `VisibilityScene` is refused.
+    Without it, ops run in eager PyTorch, and `VisibilityScene` raises.
     """
     version = core.embree_version() if core is not None else 0
     return NativeStatus(
@@ -114,14 +114,14 @@ def serves(tensor: Tensor) -> bool:
     fits = tensor.device.type == "cpu" and tensor.dtype in (torch.float32, torch.float64)
     if _backend == "native" and not fits:
         raise RuntimeError(
-            f"the native backend serves float32 and float64 on the cpu, got {tensor.dtype} on "
+            f"the native backend supports float32 and float64 on the cpu, got {tensor.dtype} on "
             f"{tensor.device}"
         )
     if core is None:
         _tell_once(f"the compiled extension is not loaded: {variant}")
     elif not fits:
         _tell_once(
-            f"kernels take float32 and float64 on the cpu, got {tensor.dtype} on {tensor.device}"
+            f"kernels support float32 and float64 on the cpu, got {tensor.dtype} on {tensor.device}"
         )
     return core is not None and fits
 
@@ -131,7 +131,7 @@ def _tell_once(why: str) -> None:
     # A compiled graph would be broken by the logging
     if why not in _told and not torch.compiler.is_compiling():
         _told.add(why)
-        log.warning("univoxel.ops runs in eager torch, many times slower: %s", why)
+        log.warning("univoxel.ops uses eager PyTorch, which is many times slower: %s", why)
 
 
 def reference_asked() -> bool:
@@ -141,7 +141,7 @@ def reference_asked() -> bool:
 
 @contextlib.contextmanager
 def use_backend(name: Backend) -> Iterator[None]:
-    """Force a side within a ``with`` block: "native", "reference", or "auto" (the default).
+    """Force a backend within a ``with`` block: "native", "reference", or "auto" (the default).
 
     Raises:
         ValueError: an unknown name.
@@ -163,8 +163,8 @@ def require() -> ModuleType:
     """The extension, or an error that says why it is missing."""
     if core is None:
         raise MissingNative(
-            f"univoxel's compiled extension is not loaded: {variant}; `univoxel doctor` says what "
-            "to do"
+            f"univoxel's compiled extension is not loaded: {variant}; run `univoxel doctor` for "
+            "help"
         )
     return core
 
@@ -178,9 +178,9 @@ def require_embree(what: str) -> ModuleType:
     found = require()
     if not found.embree_version():
         raise MissingNative(
-            f"{what}: univoxel was built without Embree, which traces its rays; install a wheel "
-            "that has it (pip install --only-binary univoxel univoxel), or Embree 3 or 4 (Debian: "
-            "apt-get install libembree-dev) and rebuild (pip install .)"
+            f"{what}: univoxel was built without Embree, which it needs for ray tracing; install "
+            "a wheel that includes it (pip install --only-binary univoxel univoxel), or Embree "
+            "3 or 4 (Debian: apt-get install libembree-dev) and rebuild (pip install .)"
         )
     return found
 
@@ -234,7 +234,7 @@ class Operator:
     ) -> None:
         """
         Args:
-            hints: types of the arguments and of what is returned, as of `hints_of`.
+            hints: types of the arguments and of what is returned, as in `hints_of`.
             fake: called as the kernel is; returns what comes out, without values.
         """
         qualified = f"univoxel::{name}"

@@ -1,4 +1,4 @@
-"""Small networks: the op, and the modules that decode what was composited along a ray."""
+"""Small networks: the op, and modules that decode features composited along a ray."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def mlp(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tenso
 
     Args:
         x: [N, A] any number of rows.
-        weights: one [out, in] a layer, as of torch.nn.Linear; every size at least 1.
+        weights: one [out, in] a layer, as in torch.nn.Linear; every size at least 1.
         biases: one [out] a layer.
 
     Returns:
@@ -54,7 +54,7 @@ def mlp(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tenso
 
 
 def mlp_reference(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
-    """The same in eager torch."""
+    """Reference in eager PyTorch."""
     for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
         x = torch.relu(torch.nn.functional.linear(x, weight, bias))
     return torch.nn.functional.linear(x, weights[-1], biases[-1])

@@ -1,5 +1,4 @@
-"""Photographs compared: patches of a surface correlated between them, and depth from how well
-pixels agree along rays."""
+"""Comparison of photographs: correlation of surface patches, and stereo matching along rays."""
 
 from __future__ import annotations
 
@@ -26,7 +25,7 @@ def patch_correlation(
     normal: Tensor,  # [N, 3]
     noise: float = 1e-3,
 ) -> tuple[Tensor, Tensor]:
-    """Correlate what patches of a surface show in one view with what others show there.
+    """Correlate patches of a surface between one view and others.
 
     The pixels of a patch look along d = direction_0 + c direction_1 + r direction_2, with c and r
     the columns and rows from its middle. They meet the plane through position with the normal at
@@ -39,7 +38,7 @@ def patch_correlation(
         brightness: [V, H, W] of all views, of any scale; below 0 where there is nothing to compare.
             H and W at least 2. Of the dtype of the others, or float16.
         projection: [V, 3, 4] world to (x z, y z, z), with x and y in pixels: 0.5 is the middle of
-            the first, as of `univoxel.camera.projection_matrices`.
+            the first, as in `univoxel.camera.projection_matrices`.
         origin: [N, 3] eye of the view that a patch is a square of pixels in.
         direction: [N, 3, 3] as above.
         own: [N, M] brightness of the pixels there, row by row; M the square of an odd number.
@@ -53,7 +52,7 @@ def patch_correlation(
         the other view, [N, K] bool.
 
     Raises:
-        TypeError, ValueError: an argument of another size or dtype than above, or out of range.
+        TypeError, ValueError: an argument has another size or dtype than above, or out of range.
 
     Differentiable in: position, normal. Second order raises.
     """
@@ -100,7 +99,7 @@ def patch_correlation_reference(
     normal: Tensor,
     noise: float = 1e-3,
 ) -> tuple[Tensor, Tensor]:
-    """The same in eager torch."""
+    """Reference in eager PyTorch."""
     rays = _rays(direction, own.shape[1])  # [N, M, 3]
     away = (normal * (position - origin)).sum(1, keepdim=True)
     nearness = (normal[:, None] * rays).sum(2) / away
@@ -192,7 +191,7 @@ def match_cost(
     radius: int = 1,
     best: int = 4,
 ) -> Tensor:
-    """How badly the photographs disagree if a pixel's surface lay at points along its ray.
+    """Matching cost between photographs for candidate points along the rays of pixels.
 
     Points start + k step are looked up in other views (bilinear); the mean absolute difference of
     the colours, `most` at the highest and where nothing is to be seen there, is averaged over a
@@ -215,7 +214,7 @@ def match_cost(
         [N, K] float32 in [0, most].
 
     Raises:
-        TypeError, ValueError: an argument of another size, dtype, device or range than above.
+        TypeError, ValueError: an argument has another size, dtype, device or range than above.
     """
     sizes = check(
         "match_cost",
@@ -265,7 +264,7 @@ def match_cost_reference(
     radius: int,
     best: int,
 ) -> Tensor:
-    """The same in eager torch."""
+    """Reference in eager PyTorch."""
     height, width = rows.shape
     t = start[:, None] + step * torch.arange(steps, dtype=start.dtype, device=start.device)
     point = origin[:, None] + t[..., None] * direction[:, None]  # [N, K, 3]
@@ -294,7 +293,7 @@ def match_cost_reference(
 
 @torch.no_grad()
 def semi_global(cost: Tensor, rows: Tensor, small: float, large: float) -> Tensor:
-    """Costs of depths that neighbours share: sums over the four straight paths to each pixel.
+    """Semi-global matching: sums of costs over the four straight paths to each pixel.
 
         L(p, k) = C(p, k) + min(L(q, k), L(q, k -+ 1) + small, m + large) - m,   m = min_i L(q, i)
 
@@ -313,7 +312,7 @@ def semi_global(cost: Tensor, rows: Tensor, small: float, large: float) -> Tenso
         [N, K] float32.
 
     Raises:
-        TypeError, ValueError: an argument of another size, dtype, device or range than above.
+        TypeError, ValueError: an argument has another size, dtype, device or range than above.
     """
     sizes = check("semi_global", cost=(cost, "N K", torch.float32), rows=(rows, "H W", torch.int64))
     _check_rows("semi_global", rows, sizes["N"])
@@ -329,7 +328,7 @@ def semi_global(cost: Tensor, rows: Tensor, small: float, large: float) -> Tenso
 
 
 def semi_global_reference(cost: Tensor, rows: Tensor, small: float, large: float) -> Tensor:
-    """The same in eager torch, line after line."""
+    """Reference in eager PyTorch, line after line."""
     has_ray = rows >= 0
     volume = cost.new_zeros(*rows.shape, cost.shape[1])
     volume[has_ray] = cost[rows[has_ray]]

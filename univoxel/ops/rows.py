@@ -1,4 +1,4 @@
-"""Some rows of a table: one step of Adam in place, and sums of their gradients."""
+"""Rows of a table: an Adam step in place, and sums of their gradients."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ def adam_rows_(
     eps: float,
     step: int,
 ) -> None:
-    """Take a step of Adam on the given rows; all other rows and their moments stay as they are.
+    """Take an Adam step on the given rows; all other rows and their moments are unchanged.
 
         m = beta1 m + (1 - beta1) g,   v = beta2 v + (1 - beta2) g^2
         param = param - lr / (1 - beta1^step) m / (sqrt(v / (1 - beta2^step)) + eps)
 
     The moments of a row decay only when the row is touched, while the bias correction counts the
-    steps of the whole table, as in ``torch.optim.SparseAdam``. eps stands beside the corrected root
+    steps of the whole table, as in ``torch.optim.SparseAdam``. eps is beside the corrected root
     as in ``torch.optim.Adam``, so that an eps which matters means the same for rows as for dense
     tensors; SparseAdam adds it to the root before the correction.
 
@@ -93,7 +93,7 @@ def adam_rows_reference_(
     eps: float,
     step: int,
 ) -> None:
-    """The same in eager torch."""
+    """Reference in eager PyTorch."""
     m = exp_avg[rows].lerp(grad, 1 - beta1)
     v = exp_avg_sq[rows].lerp(grad.square(), 1 - beta2)
     exp_avg[rows], exp_avg_sq[rows] = m, v
@@ -129,10 +129,10 @@ def sum_rows(
     values: Sequence[Tensor],  # n times [K, C]
     shape: Sequence[int],
 ) -> tuple[Tensor, Tensor]:
-    """Add up lists of rows of one table, as sparse gradients are.
+    """Sum lists of rows of one table, such as sparse gradients.
 
-    Where all lists together hold a row several times, its values are summed in the order of the
-    lists. ``torch``'s sums of sparse tensors sort, on one thread.
+    If several lists contain a row, its values are summed in the order of the lists. ``torch``, in
+    contrast, sorts to sum sparse tensors, on one thread.
 
     Args:
         rows: lists [K] int64 of numbers of rows, strictly ascending; K may differ. At least one.
@@ -174,7 +174,7 @@ def sum_rows(
 def sum_rows_reference(
     rows: Sequence[Tensor], values: Sequence[Tensor], shape: Sequence[int]
 ) -> tuple[Tensor, Tensor]:
-    """The same in eager torch, over the whole table."""
+    """Reference in eager PyTorch, over the whole table."""
     count = math.prod(shape)
     for r in rows:
         inside = not len(r) or (0 <= int(r[0]) and int(r[-1]) < count)

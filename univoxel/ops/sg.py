@@ -1,5 +1,4 @@
-"""Spherical Gaussians: lobes from numbers without limits, and shading under them by quadrature
-over the half-sphere."""
+"""Spherical Gaussians: decoding of lobes, and shading by quadrature over the hemisphere."""
 
 from __future__ import annotations
 
@@ -22,7 +21,7 @@ def decode_lobes(
     min_sharpness: float,
     max_sharpness: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Make lobes of numbers without limits.
+    """Decode lobes from unconstrained numbers.
 
         axis = v / |v|,   sharpness = min + max S(s),   amplitude = log(1 + exp(a))
 
@@ -57,7 +56,7 @@ def decode_lobes(
 def decode_lobes_reference(
     parameters: Tensor, min_sharpness: float, max_sharpness: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The same in eager torch."""
+    """Reference in eager PyTorch."""
     vector, sharpness, amplitude = parameters.split([3, 1, 3], -1)
     axis = vector * (vector * vector).sum(-1, keepdim=True).clamp_min(SHORTEST).rsqrt()
     sharpness = min_sharpness + max_sharpness * sharpness[..., 0].sigmoid()
@@ -126,7 +125,7 @@ def shade_sg(
         rgb [N, 3] linear radiance.
 
     Raises:
-        TypeError, ValueError: an argument is no tensor, or of another size or dtype than above;
+        TypeError, ValueError: an argument is not a tensor, or has another size or dtype than above;
             no directions; f0 a number outside [0, 1].
 
     Differentiable in: axis, sharpness, amplitude, normal (the directions turn with it), wo, albedo,
@@ -167,7 +166,7 @@ def shade_sg_reference(
     rotation: Tensor,
     f0: Tensor | float = 0.04,
 ) -> Tensor:
-    """The same in eager torch, in the frame of each normal, where the normal is +Z."""
+    """Reference in eager PyTorch, in the frame of each normal, where the normal is +Z."""
     to_local = torch.stack([*sphere.frame(normal), normal], 1)
     axis = torch.einsum("nij,nkj->nki", to_local, axis)
     wo = torch.einsum("nij,nj->ni", to_local, wo)[:, None]

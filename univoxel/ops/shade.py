@@ -1,5 +1,5 @@
-"""Shading under light that is given on fixed directions of the sphere, and each direction's part
-in it."""
+"""Shading under light given for fixed directions of the sphere, and the response to each
+direction."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def shade_radiance(
         rgb [N, 3] linear radiance.
 
     Raises:
-        TypeError, ValueError: an argument is no tensor, or of another size or dtype than above;
+        TypeError, ValueError: an argument is not a tensor, or has another size or dtype than above;
             no directions; solid_angle not above 0; f0 a number outside [0, 1].
         NotImplementedError: wo requires grad.
 
@@ -107,12 +107,12 @@ def shade_map(
     solid_angle: float,
     f0: Tensor | float = 0.04,
 ) -> Tensor:
-    """Radiance towards the eye of points under one distant map, partly hidden from each.
+    """Radiance towards the eye of points under one distant map that is partly occluded.
 
         rgb_n = solid_angle sum_d radiance_nd f(w_d, wo_n) max(n.w_d, 0)
         radiance_nd = visibility_pd map_d + indirect_pd,   p = index_n
 
-    shade_radiance without the [N, D, 3] radiance, which is put together sample by sample.
+    Like shade_radiance, but without the [N, D, 3] radiance, which is assembled per sample.
 
     Args:
         map: [D, 3] linear radiance of the distant light.
@@ -183,7 +183,7 @@ def shade_radiance_reference(
     solid_angle: float,
     f0: Tensor | float = 0.04,
 ) -> Tensor:
-    """The same in eager torch."""
+    """Reference in eager PyTorch."""
     if isinstance(f0, Tensor):
         f0 = f0[:, None]
     surface = (albedo[:, None], roughness[:, None])
@@ -205,7 +205,7 @@ def shade_map_reference(
     solid_angle: float,
     f0: Tensor | float = 0.04,
 ) -> Tensor:
-    """The same in eager torch; its memory grows with N D."""
+    """Reference in eager PyTorch; its memory grows with N D."""
     fraction = visibility[index].to(map.dtype)
     if visibility.dtype == torch.uint8:
         fraction = fraction / 255
@@ -276,7 +276,7 @@ def specular_response(
         [N, D]; without gradients.
 
     Raises:
-        TypeError, ValueError: an argument of another size, dtype or device than above; solid_angle
+        TypeError, ValueError: an argument has another size, dtype or device than above; solid_angle
             not above 0; f0 outside [0, 1].
     """
     sizes = check(
@@ -307,6 +307,6 @@ def specular_response_reference(
     solid_angle: float,
     f0: float = 0.04,
 ) -> Tensor:
-    """The same in eager torch."""
+    """Reference in eager PyTorch."""
     layer = brdf.specular(normal[:, None], wo[:, None], directions, roughness[:, None], f0)
     return solid_angle * layer * (normal @ directions.T).clamp_min(0)

@@ -1,4 +1,4 @@
-"""Smoothing of grids where an optimiser step touches them, and of what it is about to add."""
+"""Smoothing of the grid rows that an optimiser step updates, and of their gradients."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from univoxel.ops.differentiable import check, check_bricks
 def smooth_rows_(
     grid: Tensor, rows: Tensor, amount: float, order: int, bricks: Bricks | None = None
 ) -> Tensor:
-    """Smooth chosen nodes of a grid in place, all from the values before.
+    """Smooth the chosen nodes of a grid in place, all from their previous values.
 
         order 1:  f += amount L f      diffusion towards the mean of the neighbours
         order 2:  f -= amount L L f    thin plate: linear functions, such as a flat SDF, stay
@@ -36,7 +36,7 @@ def smooth_rows_(
         grid.
 
     Raises:
-        TypeError, ValueError: an argument of another size, dtype, device or range than above.
+        TypeError, ValueError: an argument has another size, dtype, device or range than above.
     """
     if bricks is not None:
         check_bricks("smooth_rows_", bricks, grid=(grid, "R C"))
@@ -47,7 +47,7 @@ def smooth_rows_(
     if not 0 <= amount <= 1:
         raise ValueError(f"smooth_rows_: amount must be in [0, 1], got {amount}")
     if not grid.is_contiguous():
-        raise ValueError("smooth_rows_: grid must be contiguous, it is changed in place")
+        raise ValueError("smooth_rows_: grid changes in place, so it must be contiguous")
     if not native.serves(grid):
         return smooth_rows_reference_(grid, rows, amount, order, bricks)
     core, rows = native.require(), rows.contiguous()
@@ -64,7 +64,7 @@ def smooth_rows_(
 def smooth_rows_reference_(
     grid: Tensor, rows: Tensor, amount: float, order: int, bricks: Bricks | None = None
 ) -> Tensor:
-    """The same in eager torch, over the whole grid."""
+    """Reference in eager PyTorch, over the whole grid."""
     if bricks is not None:
         node = bricks.grid_rows()
         smoothed = smooth_rows_reference_(grid[node], torch.arange(node.numel()), amount, order)
@@ -86,7 +86,7 @@ def diffuse_rows_(
     passes: int,
     bricks: Bricks | None = None,
 ) -> Tensor:
-    """Diffuse values among chosen nodes of a grid that is 0 at all others, in place.
+    """Diffuse values in place among the chosen nodes of a grid that is 0 elsewhere.
 
         f += amount L f, passes times; L as in `smooth_rows_`, f = 0 where no row is
 
@@ -107,7 +107,7 @@ def diffuse_rows_(
         values.
 
     Raises:
-        TypeError, ValueError: an argument of another size, dtype, device or range than above.
+        TypeError, ValueError: an argument has another size, dtype, device or range than above.
     """
     check("diffuse_rows_", values=(values, "K"), rows=(rows, "K", torch.int64))
     if not 0 <= amount <= 1:
@@ -117,7 +117,7 @@ def diffuse_rows_(
     if len(size) != 3 or (bricks is not None and tuple(size) != tuple(bricks.size)):
         raise ValueError(f"diffuse_rows_: size must be that of the grid, [X, Y, Z], got {size}")
     if not values.is_contiguous():
-        raise ValueError("diffuse_rows_: values must be contiguous, they are changed in place")
+        raise ValueError("diffuse_rows_: values change in place, so they must be contiguous")
     if not native.serves(values):
         return diffuse_rows_reference_(values, rows, size, amount, passes, bricks)
     core, of_rows = native.require(), rows.contiguous().numpy()
@@ -140,7 +140,7 @@ def diffuse_rows_reference_(
     passes: int,
     bricks: Bricks | None = None,
 ) -> Tensor:
-    """The same in eager torch, over the whole grid."""
+    """Reference in eager PyTorch, over the whole grid."""
     n = torch.Size(size).numel() if bricks is None else bricks.place.numel() * Bricks.NODES
     shape = (*size, 1) if bricks is None else (n, 1)
     grid = values.new_zeros(n).index_copy_(0, rows, values).view(shape)

@@ -1,4 +1,4 @@
-"""Rays against a triangle mesh: what lies between a point and the light."""
+"""Ray tracing against a triangle mesh: occlusion between a point and the light."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Hit:
 
 
 class VisibilityScene:
-    """A triangle mesh ready for rays: an Embree hierarchy, built once.
+    """A triangle mesh for ray tracing: an Embree hierarchy, built once.
 
     Args:
         vertices: [P, 3] float32, world; on the CPU.
@@ -104,7 +104,7 @@ class VisibilityScene:
         t_min: float = 0.0,
         t_max: float = float("inf"),
     ) -> Hit:
-        """The nearest triangle along each ray; arguments and errors as of `occluded`."""
+        """The nearest triangle along each ray; arguments and errors as in `occluded`."""
         _check_rays("closest_hit", origin, direction, t_min, t_max)
         scene = self.native()
         if scene is None:
@@ -125,7 +125,7 @@ class VisibilityScene:
         return hit
 
     def native(self) -> Any:
-        """The native scene, or None where the reference is asked for; for ops that trace rays."""
+        """The native scene, or None if the reference is asked for; for ops that trace rays."""
         if native.reference_asked():
             return None
         if self._native is None:

@@ -1,1 +1,1 @@
-"""What a run becomes: meshes, pages, reports, moving pictures."""
+"""Exports of a run: meshes, web pages, reports, animations."""

@@ -1,5 +1,5 @@
-"""Textured meshes: the record that writers share, its texture atlas, how a scene's field is read
-into it, and where it lies."""
+"""Textured meshes: the record that writers share, the texture atlas, baking of a scene's field, and
+placement."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FARTHEST = 1000  # sides of an object that a data set's origin may be away: floa
 
 @dataclass(frozen=True)
 class TexturedMesh:
-    """Triangles with textures, counter-clockwise seen from outside; a vertex stands in one chart.
+    """Triangles with textures, counter-clockwise seen from outside; a vertex is in one chart.
 
     Row 0 of a texture is on top, at v = 1. The field's normal at a texel is the unit vector along
 
@@ -51,7 +51,7 @@ class TexturedMesh:
     albedo: Tensor  # [T, T, 3] float32 linear, in [0, 1]; of a metal: its F0
     roughness: Tensor  # [T, T] float32 perceptual, in [0, 1]
     metallic: Tensor | None = None  # [T, T] float32 in [0, 1]; None: no metal anywhere
-    seen: Tensor | None = None  # [P] float32 in [0, 1], as of `Mesh`
+    seen: Tensor | None = None  # [P] float32 in [0, 1], as in `Mesh`
 
 
 def texture_pictures(mesh: TexturedMesh) -> dict[str, np.ndarray]:
@@ -214,7 +214,7 @@ def nearest_surface(
     two voxels away (the mesh cuts a corner, the field is no distance) they end there.
 
     Args:
-        known: points of the zero level, see `surface_beside`. The nearest stands in for one that
+        known: points of the zero level, see `surface_beside`. The nearest is in for one that
             ends off it, as on the cap of a surface that the grid's border cuts.
     """
     x, reach = points, REACH * field.voxel_size
@@ -367,7 +367,7 @@ def placement_of(
         size: the longest side of the box afterwards; None: as it is.
         origin: what comes to lie at 0: "upright" and "world", the data set's origin; "bottom", the
             middle of the box's floor; "centre", the middle of the box.
-        moved: how the data set's world was moved to the run's, as of `Photos`, which is undone.
+        moved: how the data set's world was moved to the run's, as in `Photos`, which is undone.
 
     Raises:
         UserError: the data set's origin is so far away that float32 cannot hold the vertices.
@@ -388,8 +388,8 @@ def placement_of(
     turn, at = torch.from_numpy(moved[:, :3].T.copy()), torch.from_numpy(moved[:, 3].copy())
     if (away := float((middle - at).norm())) > FARTHEST * side:
         raise UserError(
-            f"export: expected a data set whose origin is near, got an object of {side:.4g} at a "
-            f"distance of {away:.6g}: mesh files hold too few digits. Take another origin",
+            f"export: the object of size {side:.4g} is {away:.6g} from the origin, which is too "
+            "far for the digits of mesh files: use another origin",
             "origin",
         )
     return Placement(at, scale, turn)

@@ -27,7 +27,7 @@ def write_glb(path: Path, mesh: TexturedMesh, jpeg: int | None = None) -> None:
     """Write a textured mesh as GLB, turned to +Y up, whole or not at all.
 
     Args:
-        jpeg: as of `glb`.
+        jpeg: as in `glb`.
 
     Raises:
         OSError: the file cannot be written; nothing is left behind.
@@ -294,7 +294,7 @@ def write_obj(path: Path, mesh: TexturedMesh, jpeg: int | None = None) -> None:
     """Write NAME.obj, NAME.mtl and NAME_{albedo,roughness,normal}.png, each whole or not at all.
 
     A mesh with metal has a NAME_metallic.png besides. Positions stay in the world's axes, +Z up.
-    The .obj comes last: where it is, the others are. Roughness, metallic and normal map stand in
+    The .obj comes last: where it is, the others are. Roughness, metallic and normal map are in
     the widespread extension for physically based materials (Pr, Pm, map_Pr, map_Pm, norm); OBJ has
     no tangents, programs compute their own.
 
@@ -307,7 +307,7 @@ def write_obj(path: Path, mesh: TexturedMesh, jpeg: int | None = None) -> None:
     """
     name = path.stem
     if name.split() != [name]:
-        raise UserError(f"{path}: readers of OBJ need a file name without spaces")
+        raise UserError(f"{path}: OBJ files need a name without spaces")
     suffix = "png" if jpeg is None else "jpg"
     metal = "Pm 0" if mesh.metallic is None else f"Pm 1\nmap_Pm {name}_metallic.{suffix}"
     for kind, picture in texture_pictures(mesh).items():

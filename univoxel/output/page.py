@@ -1,5 +1,4 @@
-"""A run as one web page that needs no other file and no network: the object under lights that
-turn."""
+"""A run as one self-contained web page that shows the object under rotating lights."""
 
 from __future__ import annotations
 
@@ -144,7 +143,7 @@ def usual_lights() -> list[Light]:
 
 
 def light_of_file(path: Path) -> Light:
-    """A map from a file, averaged to at most MOST_ROWS rows; errors as of `read_map`."""
+    """A map from a file, averaged to at most MOST_ROWS rows; errors as in `read_map`."""
     radiance = read_map(path).radiance
     return Light(path.stem, _averaged(radiance, min(len(radiance), MOST_ROWS)))
 
@@ -245,9 +244,9 @@ POLICY = (
 LICENCE = "Drawn with three.js, \u00a9 three.js authors, MIT licence, in the page's source."
 SOURCES = {name: f"Map {name!r}: Greg Zaal, Poly Haven, CC0." for name in PHOTOGRAPHED}
 KEYS = """1 to 5: layers
-Left, Right: turn the light; Space: let it turn
-L: dragging turns the light, as it does with Shift
-B: backdrop, S: save the picture, 0: first view"""
+Left, Right: rotate the light; Space: rotate it continuously
+L: dragging rotates the light, as it does with Shift
+B: backdrop, S: save the image, 0: first view"""
 
 
 @dataclass(frozen=True)
@@ -269,14 +268,14 @@ class PageOptions:
     def __post_init__(self) -> None:
         names = [Path(path).stem for path in self.envmaps]
         if len(set(names)) != len(names):
-            raise UserError(f"envmap: expected maps of different names, got {names}", "envmap")
+            raise UserError(f"envmap: expected maps with different names, got {names}", "envmap")
 
 
 SMALL = PageOptions(faces=8_000, texture_size=512)  # for a cell of a notebook
 
 
 def write_page(run: str | Path, path: str | Path, **options: Any) -> Path:
-    """Write a run as one page that opens by double click, without a network; return its path.
+    """Write a run as a self-contained web page; return its path.
 
     Args:
         run: folder of the trained run.
@@ -301,7 +300,7 @@ def write_page(run: str | Path, path: str | Path, **options: Any) -> Path:
 def page_text(
     run: Path, scene: Scene, options: PageOptions = PageOptions(), seconds: float | None = None
 ) -> str:
-    """The page of a scene as HTML; errors as of `write_page`.
+    """The page of a scene as HTML; errors as in `write_page`.
 
     Args:
         run: the scene's folder; what is missing of log, trust report and photographs is left out.
@@ -341,7 +340,7 @@ def attributes(found: Transfer) -> dict[str, Tensor]:
 
 
 def lights_of(scene: Scene, options: PageOptions) -> list[Light]:
-    """The recovered map where there is one, those given, the usual ones of other names."""
+    """The recovered map if there is one, those given, the usual ones of other names."""
     sky = scene.environment()
     own = [] if sky is None else [Light(RECOVERED, scene.exposed(sky.latlong(MAP_ROWS)))]
     own += [light_of_file(Path(path)) for path in options.envmaps]
@@ -379,15 +378,15 @@ def facts_of(run: Path, total: float | None = None) -> list[str]:
 
 
 def about(run: Path, options: PageOptions, lights: Sequence[str]) -> str:
-    """The page's panel: notes, measures, what photographs leave open, where all comes from."""
+    """The page's panel: notes, metrics, result and uncertainty, keys, sources."""
     parts = [paragraph(options.notes)] if options.notes else []
     if options.measures:
         rows = [(escape(what), escape(value)) for what, value in options.measures.items()]
-        parts.append(f"<h2>Measures on the test views</h2>{table(rows)}")
+        parts.append(f"<h2>Metrics on the test views</h2>{table(rows)}")
     trust = run / "trust.txt"
     if trust.is_file():
         text = trust.read_text(encoding="utf-8", errors="replace").strip()
-        parts.append(f"<h2>What the photographs leave open</h2>{paragraph(text)}")
+        parts.append(f"<h2>Result and uncertainty</h2>{paragraph(text)}")
     parts.append(f"<h2>Keys</h2><p>{KEYS}</p>")
     sources = [SOURCES[name] for name in lights if name in SOURCES]
     text = " ".join([f"Made by univoxel {__version__}.", LICENCE, *sources])

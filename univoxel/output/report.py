@@ -1,7 +1,7 @@
-"""A run as a report: one page without scripts and without network, which says how good the run is,
-where it is in doubt, and what to photograph next.
+"""A report on a run: one self-contained page, without scripts, with the quality of the run, its
+uncertainty, and what to photograph next.
 
-No truth is read.
+It uses no ground truth.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class StageFacts:
 
 
 def curves(run: Path) -> list[Curve]:
-    """Loss and held-out quality over time; empty where the log cannot be read."""
+    """Loss and validation PSNR over time; empty where the log cannot be read."""
     losses: list[list[tuple[float, float]]] = []
     qualities: list[list[tuple[float, float]]] = []
     stage, resumed = None, 0.0
@@ -77,21 +77,21 @@ def curves(run: Path) -> list[Curve]:
             if line["held_out_psnr"] is not None:
                 qualities[-1].append((seconds, float(line["held_out_psnr"])))
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
-        log.info("no curves: %s cannot be read: %s", run / LOG, error)
+        log.info("no curves: %s could not be read: %s", run / LOG, error)
         return []
     found = (
-        Curve("loss: the sum of what is minimised", losses, logarithmic=True),
-        Curve("validation, PSNR in dB", qualities),
+        Curve("loss: the sum of all terms", losses, logarithmic=True),
+        Curve("validation PSNR, dB", qualities),
     )
     return [curve for curve in found if any(curve.pieces)]
 
 
 def configuration(run: Path) -> TrainConfig | None:
-    """What the run was trained with; None where its config.json cannot be read."""
+    """What the run was trained with; None if its config.json cannot be read."""
     try:
         return load_config(run / "config.json")
     except (UserError, OSError) as error:
-        log.info("stages are not told: %s", error)
+        log.info("stages are missing: %s", error)
         return None
 
 
@@ -104,9 +104,9 @@ def stages(cfg: TrainConfig, state: dict[str, Any]) -> list[StageFacts]:
         if share is None:
             fate = "not begun" if k > len(made) or not state.get("progress") else "not ended"
         elif k in early:
-            fate = "ended early: nothing was left to gain"
+            fate = "ended early, because it stopped improving"
         elif share < ALL:
-            fate = "stopped early" if state.get("finished") else "cut by the time limit"
+            fate = "stopped early" if state.get("finished") else "shortened by the time limit"
         else:
             fate = "whole"
         seconds = took[k] if k < len(took) else None
@@ -133,29 +133,29 @@ def remarks(cfg: TrainConfig, state: dict[str, Any]) -> list[str]:
     """What time cut, what went wrong, what was chosen; sentences."""
     told = []
     if state.get("stage", 0) < len(cfg.stages):
-        told.append(f"Training has not ended: it stands in stage {state.get('stage', 0) + 1}.")
+        told.append(f"Training has not ended: it is in stage {state.get('stage', 0) + 1}.")
     if cut := Clock(cfg, 0.0, state).cut():
         told.append(cut[0].upper() + cut[1:] + ".")
     troubles: Sequence[str] = state.get("troubles", ())
     if troubles:
-        told.append(f"Training met trouble {len(troubles)} times, the last in {troubles[-1]}.")
+        told.append(f"Training recovered {len(troubles)} times, last in {troubles[-1]}.")
     chosen = [entry.get("said", "") for entry in state.get("chosen", ())]
-    return told + [f"Size chosen: {said}." for said in chosen if said]
+    return told + [f"Model size: {said}." for said in chosen if said]
 
 
 FOLDER = Path(__file__).parent / "web"
-RING_GAP = 60.0  # degrees between neighbouring azimuths that are worth a word, as of `poses`
-TRUTH = "No truth was read: all of this is computed from the photographs and the model."
+RING_GAP = 60.0  # degrees between neighbouring azimuths that are worth a word, as in `poses`
+TRUTH = "This report uses no ground truth: it is computed from the photographs and the model."
 CHARTS = (
-    "Stages minimise different sums, so the loss jumps between them. Held-out pixels are shown by "
-    "the radiance head first, and by light and materials once those are trained."
+    "Stages minimise different sums, so the loss jumps between them. The validation PSNR is "
+    "that of the radiance head first, and that of light and materials once they are trained."
 )
 LAYERS = {
     "render": "in the light of the photographs",
     "albedo": "colour without light",
-    "roughness": "black mirrors, white is matte",
+    "roughness": "black is glossy, white is matte",
     "metal": "white is metal",
-    "normal": "in the world's axes",
+    "normal": "in world axes",
 }
 
 
@@ -217,7 +217,7 @@ def write_report(run: str | Path, path: str | Path, **options: Any) -> Path:
 def report_text(
     run: Path, scene: Scene, state: dict[str, Any], options: ReportOptions = ReportOptions()
 ) -> str:
-    """The report of a scene as HTML; errors as of `write_report`.
+    """The report of a scene as HTML; errors as in `write_report`.
 
     Args:
         run: the scene's folder; what is missing of log, configuration and photographs is left out,
@@ -231,7 +231,7 @@ def report_text(
     except (UserError, OSError) as error:  # moved, or not on this machine
         if options.data is not None:
             raise
-        why = f"The photographs cannot be read, so this is left out: {error}."
+        why = f"The photographs could not be read, so this part is missing: {error}."
     title = options.title or run.resolve().name or "univoxel"
     front = START[0] if known is None else known.advice.front
     doubts = None if known is None else Doubts(known.surveyed)
@@ -285,24 +285,23 @@ def next_section(advice: Advice) -> str:
         ]
         parts.append(table(rows, ("", "from", "nearest so far", "worth")))
     else:
-        parts.append(
-            paragraph("Nothing stands out: photographs are all around what can be seen from there.")
-        )
+        parts.append(paragraph("There are photographs from all useful directions."))
     told = [f"{line[0].upper()}{line[1:]}." for line in missing(advice, RING_GAP)]
     if advice.hidden >= 0.01:
         told.append(
-            f"{advice.hidden:.0%} of the surface is seen by no photograph, nor from any of these "
-            "directions: turn the object over for a second run, or leave it as it is."
+            f"{advice.hidden:.0%} of the surface is not seen in any photograph, nor from any of "
+            "these directions: turn the object over for a second run, or leave it as it is."
         )
     told.append(
-        f"The front is where {advice.front_name} was taken. Left and right are those of whoever "
-        "stands there. Keep the distance of the other photographs, and their light."
+        f"The front is where {advice.front_name} was taken. Left and right are as seen from "
+        "there. Keep the distance and the light of the other photographs."
     )
     parts += [paragraph(line) for line in told]
     legend = (
-        "The directions around the object, seen from above. White: photographs. Bright: what one "
-        "more would add. Ringed: a gap, no photograph is near. Numbers: what to take, the best "
-        "first. Worth: share of the surface that it would fix, at most."
+        "Directions around the object, seen from above. White dots: photographs. Bright: a "
+        "photograph from there would help. Rings: gaps without photographs. Numbers: "
+        "photographs to take, the best first. Worth: the share of the surface that a photograph "
+        "would resolve at most."
     )
     left = "\n".join(parts)
     figure = f"<figure>{report_pictures.sphere(advice)}<figcaption>{legend}</figcaption></figure>"
@@ -310,9 +309,9 @@ def next_section(advice: Advice) -> str:
 
 
 def doubt_section(known: Known, state: dict[str, Any], pictures: Sequence[Tensor]) -> str:
-    """What photographs leave open, in words and painted on the object."""
+    """The uncertainty, in words and painted on the object."""
     text = words(numbers(known.surveyed), list(state.get("troubles", [])))
-    legend = "Doubt of the albedo: black is well determined, white is a guess."
+    legend = "Uncertainty of the albedo: black is well determined, white is a guess."
     return paragraph(text) + gallery(zip(report_pictures.SIDES, pictures, strict=True), legend)
 
 
@@ -326,14 +325,14 @@ def views_section(scene: Scene, known: Known, options: ReportOptions) -> str:
     rows = []
     for view in found:
         kind = "" if view.trained else " (not trained on)"
-        words = f"{view.name}{kind}: {view.error:.3f} in sRGB on the mean, {view.quality:.1f} dB"
+        words = f"{view.name}{kind}: mean error {view.error:.3f} in sRGB, {view.quality:.1f} dB"
         tiles = "".join(image(tile, words) for tile in view.tiles)
         caption = f"<figcaption>{escape(words)}</figcaption>"
         rows.append(f'<figure class="row">{tiles}{caption}</figure>')
     said = (
-        f"The {len(found)} that differ most, of {count} compared: photograph, render, and their "
-        f"difference, drawn brightest at {report_pictures.LIMIT} in sRGB. Numbers are over the "
-        "object."
+        f"The {len(found)} of {count} compared photographs that differ most: photograph, render, "
+        f"and their difference, with white at {report_pictures.LIMIT} in sRGB. Numbers are for "
+        "the object only."
     )
     return paragraph(said) + f'<div class="views">{"".join(rows)}</div>'
 
@@ -347,21 +346,21 @@ def materials_section(pictures: dict[str, list[Tensor]]) -> str:
         for name, row in pictures.items()
     ]
     if "metal" not in pictures:
-        parts.append(paragraph("Nothing is metal."))
+        parts.append(paragraph("No metal was found."))
     return "\n".join(parts)
 
 
 def light_section(scene: Scene, mesh: Mesh) -> str:
-    """The recovered light as a map, and a grey and a mirror ball under it."""
+    """The recovered light as a map, with a diffuse and a chrome sphere under it."""
     found = report_pictures.found_light(scene, mesh)
     if found is None:
         kind = scene.cfg.light.kind
-        return paragraph(f"No light was recovered: it was trained with {kind} light.")
-    names = ("map", "grey ball", "mirror ball")
+        return paragraph(f"There is no environment map: the run was trained with {kind} light.")
+    names = ("map", "diffuse sphere", "chrome sphere")
     tiles = zip(names, report_pictures.pictures_of(found), strict=True)
     legend = (
-        "Balls are seen from +X, with +Z up. Light and albedo share a scale for each channel, "
-        "which photographs do not fix."
+        "Spheres are seen from +X, with +Z up. Photographs cannot separate the scale of light "
+        "and albedo, per channel."
     )
     return paragraph(found.about) + gallery(tiles, legend, "light")
 
@@ -375,10 +374,10 @@ def training_section(run: Path, state: dict[str, Any]) -> str:
         parts.append(f'<div class="charts">{"".join(drawn)}</div>')
         parts.append(paragraph(CHARTS))
     else:
-        parts.append(paragraph("There is no log of this training to draw."))
+        parts.append(paragraph("This training has no log to draw."))
     cfg = configuration(run)
     if cfg is None:
-        return "\n".join([*parts, paragraph("config.json cannot be read: stages are not told.")])
+        return "\n".join([*parts, paragraph("config.json could not be read.")])
     rows = []
     if (before := prepared(state)) is not None:
         rows.append(("preparation", "", "", f"{before:.1f} s", ""))
@@ -387,7 +386,7 @@ def training_section(run: Path, state: dict[str, Any]) -> str:
         took = "" if fact.seconds is None else f"{fact.seconds:.1f} s"
         rows.append((f"{k + 1}: {fact.name}", f"{fact.planned:,}", made, took, fact.fate))
     parts.append(table(rows, ("stage", "planned steps", "made", "time", "")))
-    limit = "" if cfg.minutes is None else f"The limit was {60 * cfg.minutes:,.0f} s."
+    limit = "" if cfg.minutes is None else f"The time limit was {60 * cfg.minutes:,.0f} s."
     told = [limit, *remarks(cfg, state)]
     return "\n".join([*parts, *(paragraph(line) for line in told)])
 

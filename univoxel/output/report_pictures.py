@@ -1,4 +1,4 @@
-"""Pictures of a report: photographs beside renders, four sides, the light, drawings."""
+"""Images of a report: photographs beside renders, four sides, the light, diagrams."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def worst(
 def compared(
     scene: Scene, split: Split, view: int, size: int, albedo_near: AlbedoNear | None = None
 ) -> Compared:
-    """One view, at most `size` pixels along its longer side; `albedo_near` as of `worst`."""
+    """One view, at most `size` pixels along its longer side; `albedo_near` as in `worst`."""
     photos = split.photos
     share = min(1.0, size / max(photos.cameras.size(view)))
     cameras = resize(photos.cameras, max(1, round(share * photos.cameras.width)))
@@ -114,7 +114,7 @@ def compared(
 
 
 def on_grey(premultiplied: Tensor, alpha: Tensor) -> Tensor:
-    """Linear colours [h, w, 3], premultiplied, as sRGB on what stands behind them in a report."""
+    """Linear colours [h, w, 3], premultiplied, as sRGB on what is behind them in a report."""
     straight = premultiplied / alpha[..., None].clamp_min(1e-6)
     return linear_to_srgb(straight) * alpha[..., None] + BEHIND * (1 - alpha[..., None])
 
@@ -139,7 +139,7 @@ def layers(
 
     Args:
         front: azimuth of the front, degrees from +X.
-        albedo_near: as of `worst`.
+        albedo_near: as in `worst`.
     """
     cameras = orbit(mesh, len(SIDES), size, ELEVATION, front)
     found: dict[str, list[Tensor]] = {}
@@ -203,19 +203,19 @@ def found_light(scene: Scene, mesh: Mesh) -> FoundLight | None:
     """
     sky = scene.environment()
     if sky is not None:
-        about = "The environment map that was recovered."
+        about = "The recovered environment map."
         if scene.flash is not None:
-            about += " Beside it a flash at the camera lit the photographs."
+            about += " In addition, a flash at the camera lit the photographs."
         return FoundLight(scene.exposed(sky.latlong(ROWS)), about)
     if not isinstance(scene.light, AbstractLocalLight):
         return None
     about = (
-        f"This run has no environment map: its light is local ({scene.cfg.light.kind}) and differs "
-        "from point to point. The map shows what points that face a direction get from there, on "
-        "the mean; it holds the shadows of the object on itself too."
+        f"This run has no environment map: its light is local ({scene.cfg.light.kind}) and "
+        "differs from point to point. The map shows the mean light of the points that face each "
+        "direction, which includes shadows of the object on itself."
     )
     if scene.cfg.turntable is not None:
-        about += " It stands in the room of the turntable."
+        about += " It is fixed to the room around the turntable."
     return FoundLight(local_map(scene, mesh), about)
 
 

@@ -1,5 +1,4 @@
-"""The surface of a scene as a clean, closed mesh: what photographs saw stays, what none saw is
-smooth."""
+"""The surface of a scene as a clean, closed mesh; parts that no photograph shows are smoothed."""
 
 from __future__ import annotations
 
@@ -52,7 +51,7 @@ def surface_of(scene: Scene, cameras: Cameras | None = None) -> Mesh:
     mesh, dropped = cleaned(Mesh(*scene.field.isosurface(closed=True)))
     if dropped.crumbs or dropped.voids:
         log.info(
-            "mesh: small pieces beside the object that were left out: %d; hollows inside it: %d",
+            "mesh: %d small pieces beside the object and %d hollows inside it were left out",
             dropped.crumbs,
             dropped.voids,
         )
@@ -64,7 +63,7 @@ def surface_of(scene: Scene, cameras: Cameras | None = None) -> Mesh:
     mesh = smoothed(mesh, seen, REACH * scene.field.voxel_size)
     assert mesh.seen is not None
     if guess := float((mesh.seen < 0.5).float().mean()):
-        log.info("mesh: no photograph shows %.1f %% of it; it is smooth there", 100 * guess)
+        log.info("mesh: %.1f %% of it is smooth, because no photograph shows it", 100 * guess)
     return mesh
 
 
@@ -73,7 +72,7 @@ def cameras_of(scene: Scene, run: Path) -> Cameras | None:
     try:
         return scene.registered(photos_of(run, split="train")).cameras
     except (UserError, OSError) as error:
-        log.info("mesh: nothing is smoothed, for what photographs show is not known: %s", error)
+        log.info("mesh: not smoothed, because photographs could not be read: %s", error)
         return None
 
 

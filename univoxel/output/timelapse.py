@@ -1,4 +1,4 @@
-"""Moving pictures: GIF or MP4, and one view of a scene while it is trained."""
+"""Animations as GIF or MP4, and a view of a scene during training."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def require(kind: str) -> None:
 def write_animation(path: Path, pictures: Sequence[Path], rate: int = FRAMES_PER_SECOND) -> None:
     """Write pictures, on white where they are transparent, `rate` a second.
 
-    Of differing sizes, they stand in the middle of frames that hold the largest. Whole or not at
+    Of differing sizes, they are in the middle of frames that hold the largest. Whole or not at
     all; a GIF runs in a loop; an MP4 is H.264, cut to even sizes.
 
     Raises:
@@ -89,7 +89,7 @@ def _ffmpeg():
         import imageio_ffmpeg  # pyright: ignore[reportMissingImports]  the extra `video`
     except ImportError:
         raise MissingExtra(
-            "an MP4 needs imageio-ffmpeg: pip install 'univoxel[video]', or choose gif"
+            "an MP4 needs imageio-ffmpeg: pip install 'univoxel[video]', or use gif"
         ) from None
     return imageio_ffmpeg
 

@@ -1,6 +1,6 @@
-"""Which triangles an exported mesh keeps: cleaning, closing and decimation.
+"""Clean-up, closing and decimation of exported meshes.
 
-Functions take and give the geometry alone, and what is seen of it where that is known; what else a
+Functions take and give the geometry only, and what is seen of it where that is known; what else a
 mesh carries at its vertices is dropped.
 """
 
@@ -51,7 +51,7 @@ def cleaned(mesh: Mesh) -> tuple[Mesh, Dropped]:
         faces = _without_degenerate(_welded(vertices, faces))
         faces, dropped = _component_faces(vertices, faces)
     if not len(faces):
-        raise NoSurface("the surface has no part that encloses volume")
+        raise NoSurface("the surface has no part that encloses a volume")
     used, index = np.unique(faces, return_inverse=True)
     seen = None if mesh.seen is None else mesh.seen[torch.from_numpy(used)]
     return _mesh(vertices[used], index.reshape(-1, 3), seen), dropped

@@ -1,4 +1,4 @@
-"""Cameras of relit frames, test views, an orbit, a path from a file; and the frames they make."""
+"""Cameras of relit frames (test views, an orbit, a path from a file) and the frames."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def frames_of(names: list[str], lights: Iterable[str], turn: int | None) -> list
     """Frames by view, so that a view's surface serves all its lights.
 
     Args:
-        turn: frames of a turn of the light seen by the first camera alone; None for every camera
+        turn: frames of a turn of the light seen by the first camera only; None for every camera
             under still light.
     """
     if turn is not None and turn < 1:
@@ -80,7 +80,7 @@ def orbit(
 def views_of(
     run: Path, cameras: str | Path | Cameras, resolution: int | None, elevation: float, mesh: Mesh
 ) -> tuple[list[str], Cameras]:
-    """Names of the views, and their cameras; arguments as of `cli.relight.RelightOptions`.
+    """Names of the views, and their cameras; arguments as in `cli.relight.RelightOptions`.
 
     Raises:
         UserError: the cameras cannot be used.
@@ -161,7 +161,7 @@ class Studio:
 def open_studio(
     run: Path, cameras: str | Path | Cameras, resolution: int | None, elevation: float
 ) -> Studio:
-    """Load the scene and its mesh, and build the mesh's ray hierarchy; views as of `views_of`."""
+    """Load the scene and its mesh, and build the mesh's ray hierarchy; views as in `views_of`."""
     scene = load_scene(run)
     mesh = extract_mesh(scene)
     names, views = views_of(run, cameras, resolution, elevation, mesh)

@@ -1,1 +1,1 @@
-"""What happens before the first gradient: masks, cameras, exposures and the carved visual hull."""
+"""Steps before the first gradient: masks, cameras, exposures and the carved visual hull."""

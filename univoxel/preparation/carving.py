@@ -1,5 +1,4 @@
-"""Space carving of concavities that no silhouette shows, by depths of a plane sweep below the
-visual hull."""
+"""Space carving of concavities that no silhouette shows, with depths from a plane sweep."""
 
 from __future__ import annotations
 
@@ -137,7 +136,7 @@ def depths_below_hull(
         yield maps[0], maps[1], maps[2]
 
 
-# Space carving of concavities that no silhouette shows, such as of cups.
+# Space carving of concavities that no silhouette shows, such as in cups.
 #
 # Depths come from a semi-global plane sweep below the visual hull. A node of the hull is carved
 # where
@@ -175,7 +174,7 @@ PIECE = 5e-4
 ROUNDS = 3
 
 
-COVERED = 0.9 * 255  # coverage above which a pixel shows the object alone
+COVERED = 0.9 * 255  # coverage above which a pixel shows the object only
 
 
 @torch.no_grad()

@@ -1,5 +1,4 @@
-"""Where the object can be: bounds and a first SDF from silhouettes, and what photographs show of
-its points."""
+"""The visual hull: bounds and a first SDF from silhouettes, and colours of its points."""
 
 from __future__ import annotations
 
@@ -200,7 +199,7 @@ def estimate_bounds(
         inside = nodes[sdf < grid.voxel_size]
         if not len(inside):
             raise UserError(
-                "the silhouettes of the photographs share no volume: check masks and cameras"
+                "the silhouettes of the photographs have no common volume: check masks and cameras"
             )
         lower, upper = inside.amin(0), inside.amax(0)
         margin = MARGIN * (upper - lower).norm() + grid.voxel_size

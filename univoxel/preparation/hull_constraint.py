@@ -1,4 +1,4 @@
-"""Where the visual hull is right because it explains what mirrors.
+"""Parts of the visual hull that are kept because they explain reflections.
 
 What a mirror shows lies behind it for all photographs, so colours pull its surface there, and bend
 it. Yet silhouettes give the shape of most polished things to a fraction of a voxel. Whether they do
@@ -61,9 +61,9 @@ GAIN = 0.6
 LEAST_SHARE = 0.05
 # Correlation of their changes with those of the table
 CORRELATION = 0.5
-# Change of points of the table from which regions grow that are pinned. Half of the chrome of a
+# Change of points of the table from which regions grow that are frozen. Half of the chrome of a
 # scene changed by 0.30 to 0.43, half of its rough copper by 0.18 to 0.31: that is trained better
-# than it is pinned
+# than it is frozen
 STRONG_CHANGE = 0.33
 # Change of points that they take in
 WEAK_CHANGE = 0.26
@@ -84,7 +84,7 @@ class PinnedHull:
 
     position: Tensor  # [P, 3] world
     pinned: Tensor  # [P] bool
-    distance: Tensor  # of masks, as of `visual_hull`
+    distance: Tensor  # of masks, as in `visual_hull`
     cameras: Cameras
 
     def nodes(self, sdf: Tensor, grid: GridShape) -> Tensor:
@@ -99,7 +99,7 @@ class PinnedHull:
 
     @torch.no_grad()
     def pin_(self, field: Field) -> None:
-        """Put the hull back where it is pinned, and give its nodes there no gradient from now on.
+        """Put the hull back where it is frozen, and give its nodes there no gradient from now on.
 
         A field in bricks, which are finer than the hull is right, stays as it is.
         """
@@ -123,7 +123,7 @@ def pinned_hull(
 
     Args:
         photos: in one light and exposure, their cameras where they are believed to be.
-        distance: of masks, as of `visual_hull`.
+        distance: of masks, as in `visual_hull`.
         hull: [X, Y, Z] sdf of the visual hull on the grid, world units.
     """
     seen = observe_hull(photos, hull, grid, POINTS)
@@ -166,7 +166,7 @@ def mirroring(seen: Observations, hull: Tensor, grid: GridShape) -> Tensor:
 def grown(strong: Tensor, weak: Tensor, nearest: Tensor) -> Tensor:
     """Regions that begin where most points are strong, and take in weak ones and holes: [N] bool.
 
-    Some of a mirror shows what stands beside it, or is not seen often enough.
+    Some of a mirror shows what is beside it, or is not seen often enough.
 
     Args:
         strong, weak: [N] bool.
@@ -190,7 +190,7 @@ class MirrorObservations:
 
     point: Tensor  # [S] int64
     color: Tensor  # [S, 3] sRGB
-    bin: Tensor  # [S] int64, of the mirrored direction
+    bin: Tensor  # [S] int64, of the reflected direction
     turned: Tensor  # [N] int64, class of the normal
     apart: Tensor  # [K, K] float 0 or 1, whether classes of normals differ by `turn`
     neighbours: Tensor  # [N, M] int64, points around each that were seen often enough

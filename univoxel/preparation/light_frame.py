@@ -1,4 +1,4 @@
-"""What the light stood still in: the world, the room of a turntable, or, as a flash, the camera.
+"""The frame that the light is fixed to: the world, the room of a turntable, or the camera.
 
 Of a turntable also a background that stood still, and cameras off the circle of the others.
 """
@@ -105,7 +105,7 @@ def _correlation(
 
 # Photographs of a turntable whose cameras do not stand on the circle of the others.
 #
-# Structure from motion that finds too few matches somewhere goes on from there a few degrees off.
+# Structure from motion that finds too few matches somewhere continues from there a few degrees off.
 # Silhouettes and matches of pairs hardly show it: along the circle a round object looks alike, and
 # what is matched moves along the lines that it is held against.
 
@@ -138,8 +138,8 @@ def say_strays(photos: Photos) -> None:
     names = ", ".join(photos.names[view] for view in found[:NAMED])
     log.warning(
         "%d of %d photographs were placed off the circle of their turntable, by up to %.1f "
-        "degrees, the others by %.1f in the median: what %s%s show will not fit the rest; "
-        "`univoxel poses` with their masks places all anew; see cameras",
+        "degrees, the others by a median of %.1f. Surfaces that only %s%s show will not fit; to "
+        "find all poses again, run `univoxel poses` with their masks; see cameras",
         len(found),
         len(photos),
         math.degrees(float(circle.off[strays].max())),
@@ -156,7 +156,7 @@ def say_strays(photos: Photos) -> None:
 # light turns as the camera does. Then a point is bright where its normal faces the light as seen
 # from the camera. Under a light that stands still a point keeps its shade, and changes only by what
 # it mirrors. Each is a smooth function on the sphere. It is fitted to half of the photographs, and
-# the other half says how well it foretells them: the light that does better there is believed.
+# the other half says how well it predicts them: the light that does better there is believed.
 
 
 # Points of the surface whose colours are compared
@@ -169,7 +169,7 @@ CAUCHY = 0.1
 ROUNDS = 6
 # Standard errors, over the photographs, by which a turning light has to be ahead of a still one
 CERTAIN = 2.0
-# Share of the shade of a flash that points show at least where there is one: paint does. Elsewhere
+# Share of the shade of a flash that points show at least if there is one: paint does. Elsewhere
 # it was -0.4 to 0, for towards the outline surfaces do not become darker
 SHADE = 0.1
 # Natural log by which points that face the camera are brighter than others at least, if they do not
@@ -184,7 +184,7 @@ LEAST = 0.03
 
 @dataclass(frozen=True)
 class Explained:
-    """How well either light foretells photographs that it was not fitted to."""
+    """How well either light predicts photographs that it was not fitted to."""
 
     # Shares of the robust cost of how points change that go away
     by_still_light: float
@@ -229,8 +229,8 @@ def light_frame_of(
     if frame == "turntable":
         if turntable is None:
             raise DataError(
-                f"{photos.folder}: light_frame turntable: the cameras do not stand around one "
-                "upright axis, so where the turntable's is cannot be told",
+                f"{photos.folder}: light_frame turntable: the cameras are not around one upright "
+                "axis, so the turntable's axis is unknown",
                 "light_frame",
             )
         return LightFrame(turntable)
@@ -241,8 +241,8 @@ def light_frame_of(
     log.debug("flash: %s", flashed)
     if (flashed.shade > SHADE or flashed.glint > GLINT) and flashed.ahead > CERTAIN:
         log.info(
-            "a flash at the camera lit the object: that explains %.0f %% more of how points change "
-            "from photograph to photograph than a light that stands still; see light_frame",
+            "light: a flash at the camera, which explains %.0f %% more of the colour changes "
+            "between photographs than a light that stands still; see light_frame",
             100 * flashed.saved,
             extra={"arguments": ("light_frame",)},
         )
@@ -259,9 +259,9 @@ def light_frame_of(
     if not still_around and found.saved < LEAST:
         return LightFrame()
     log.info(
-        "the light turns with the camera, as on a turntable%s: that explains %.0f %% of how points "
-        "change from photograph to photograph, a light that stands still %.0f %%; see light_frame",
-        f", on which the object lay in {len(turntable.tables)} ways" if turntable.others else "",
+        "light: it turns with the camera, as on a turntable%s; that explains %.0f %% of the "
+        "colour changes between photographs, a light that stands still %.0f %%; see light_frame",
+        f", with {len(turntable.tables)} positions of the object" if turntable.others else "",
         100 * found.by_turning_light,
         100 * max(found.by_still_light, 0.0),  # none, where the other half contradicts it
         extra={"arguments": ("light_frame",)},
@@ -271,7 +271,7 @@ def light_frame_of(
 
 @dataclass(frozen=True)
 class Flashed:
-    """How well a flash foretells photographs that it was not fitted to."""
+    """How well a flash predicts photographs that it was not fitted to."""
 
     shade: float  # share of the shade of a flash alone that points show
     glint: float  # natural log by which points that face the camera are brighter than others
@@ -281,17 +281,17 @@ class Flashed:
 
 @torch.no_grad()
 def explained_by_flash(observations: Observations, gains: Tensor | None = None) -> Flashed:
-    """How well a flash foretells how points change from photograph to photograph.
+    """How well a flash predicts how points change from photograph to photograph.
 
     It lights a point by the cosine to the camera over the squared distance. The surroundings light
     it too, so that it shows only a share of that. What is glossy shows its highlight where it faces
     the camera.
 
     Args:
-        gains: as of `light_frame_of`.
+        gains: as in `light_frame_of`.
     """
     log_color, point, view, normal, wo = comparable(observations, gains)
-    facing = (normal * wo).sum(1, keepdim=True)  # well above 0, as of `observe`
+    facing = (normal * wo).sum(1, keepdim=True)  # well above 0, as in `observe`
     away = (observations.eye[view] - observations.position[point]).norm(dim=1, keepdim=True)
     still = smooth(2 * facing * normal - wo)
     shade = facing.log() - 2 * (away / away.mean()).log()
@@ -311,12 +311,12 @@ def explained_by_flash(observations: Observations, gains: Tensor | None = None) 
 def explained(
     observations: Observations, turntable: Turntable, gains: Tensor | None = None
 ) -> Explained:
-    """How well either light foretells how points change from photograph to photograph.
+    """How well either light predicts how points change from photograph to photograph.
 
-    Of photographs in two random halves, each is foretold by what was fitted to the other.
+    Of photographs in two random halves, each is predicted by what was fitted to the other.
 
     Args:
-        gains: as of `light_frame_of`.
+        gains: as in `light_frame_of`.
     """
     log_color, point, view, normal, wo = comparable(observations, gains)
     facing = (normal * wo).sum(1, keepdim=True)

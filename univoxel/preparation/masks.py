@@ -1,4 +1,4 @@
-"""Whether masks end where the object does: there pictures change more than beside it."""
+"""Detects masks that extend past the object, where images change most beside the mask's edge."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def mask_excess(
     """Pixels by which masks are too wide, all of them alike; 0 where they fit or nothing tells.
 
     Across the edge of a mask, colours change most at the object's outline: in the mean over all
-    photographs everything else, the object's pattern or what stands behind it, lies anywhere.
+    photographs everything else, the object's pattern or what is behind it, lies anywhere.
 
     Args:
         color: V photographs [H, W, 3], uint8 sRGB or linear. What surrounds the object may be
@@ -111,7 +111,7 @@ def as_srgb(stored: Tensor) -> Tensor:
 
 
 def cut_away(encoded: Tensor, covered: Tensor, distance: Tensor) -> bool:
-    """Whether a photograph [H, W, 3] sRGB no longer shows what stands around the object."""
+    """Whether a photograph [H, W, 3] sRGB no longer shows what is around the object."""
     around = encoded[covered < 0.01]
     same = (around == around.median(0).values).all(1) if len(around) else torch.ones(1)
     return float(same.float().mean()) > ONE_COLOR or repeats_edge(encoded, distance)
@@ -144,7 +144,7 @@ def fitted_masks(photos: Photos, wanted: MasksFrom) -> tuple[Photos, Tensor]:
     """The photographs with masks that fit, as far as those are too wide, and `mask_distances`.
 
     Args:
-        wanted: as of the configuration.
+        wanted: as in the configuration.
     """
     cameras = photos.cameras
     distance = mask_distances(photos.alpha, cameras)
@@ -155,11 +155,11 @@ def fitted_masks(photos: Photos, wanted: MasksFrom) -> tuple[Photos, Tensor]:
     excess = mask_excess(colors, covered, away)
     if not excess:
         return photos, distance
-    much = f"masks are {excess} {'pixel' if excess == 1 else 'pixels'} too wide"
+    much = f"masks extend {excess} {'pixel' if excess == 1 else 'pixels'} past the object's edge"
     if wanted == "given":
-        log.info("%s: see masks=auto", much, extra={"arguments": ("masks",)})
+        log.info("%s: masks=auto erodes them", much, extra={"arguments": ("masks",)})
         return photos, distance
-    log.info("%s: they are taken in", much)
+    log.info("%s: they are eroded", much)
     return with_masks(photos, lambda view: eroded(distance[view], excess))
 
 

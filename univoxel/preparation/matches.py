@@ -1,4 +1,4 @@
-"""Cameras against photographs: points found again in neighbouring views, and epipolar lines."""
+"""Points matched between neighbouring photographs, and the epipolar error of the cameras."""
 
 from __future__ import annotations
 

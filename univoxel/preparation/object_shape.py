@@ -1,5 +1,4 @@
-"""The object told in 3D: what masks and depth maps of all photographs say of each place, gaps
-that few see through included."""
+"""The shape of the object from the masks and depth maps of all photographs."""
 
 from __future__ import annotations
 
@@ -26,7 +25,7 @@ from univoxel.preparation.stereo import DepthMaps, pixels_of, reach
 
 # Gaps that few masks see through, taken out of a hull that the others filled.
 #
-# Between cups on a tray, or under an arch, only pictures from the side see what stands behind. They
+# Between cups on a tray, or under an arch, only pictures from the side see what is behind. They
 # are outvoted, although they are right. A mask that lost a part of the object looks the same in its
 # own picture, but not in those of others: without that part they have something that nothing
 # covers.
@@ -67,7 +66,7 @@ def carve_gaps_(
     kept = np.ones(len(nodes), bool)
     for _ in range(GAP_ROUNDS):
         before = kept.sum()
-        for one in track(sights, "looking through gaps"):
+        for one in track(sights, "seen through gaps"):
             for gap in _gaps(one):
                 gone = kept & gap[one.pixel]
                 if gone.any() and _agrees(sights, gone):
@@ -187,8 +186,8 @@ def box_corners(box: Sequence[float]) -> Tensor:
     sides = list(zip(values[:3], values[3:], strict=False))
     if len(values) != 6 or not all(-math.inf < a < b < math.inf for a, b in sides):
         raise UserError(
-            "box: expected X0 Y0 Z0 X1 Y1 Z1, each of the first three below its counterpart, got "
-            f"{words_of(values)}",
+            "box: expected X0 Y0 Z0 X1 Y1 Z1, with each of the first three below its "
+            f"counterpart, got {words_of(values)}",
             "box",
         )
     return torch.tensor(values).view(2, 3)
@@ -222,9 +221,9 @@ def box_shown(cameras: Cameras, view: int, box: Tensor) -> Tensor:
 def nothing_inside(box: Tensor, what: str, cameras: Cameras) -> UserError:
     """What to raise where the box [2, 3] is in the wrong place."""
     return UserError(
-        f"box: expected one that the object lies in, got {words_of(box.flatten().tolist())}, where "
-        f"{what}; the cameras look at {words_of(looked_at(cameras).tolist())}, and half of them "
-        f"show {reach(cameras):.4g} around it",
+        f"box: expected a box around the object, got {words_of(box.flatten().tolist())}, in "
+        f"which {what}; the cameras look at {words_of(looked_at(cameras).tolist())}, and half of "
+        f"them show {reach(cameras):.4g} around it",
         "box",
     )
 
@@ -250,9 +249,9 @@ def find_object(
     first = fit_grid(*corners, FIRST_VOXELS**3)
     share = in_box(share_of(votes(shown, maps, first), len(masks)), first, box)
     if box is not None and share.max() < AROUND:
-        raise nothing_inside(box, "most masks show nothing in common", cameras)
+        raise nothing_inside(box, "most masks have nothing in common", cameras)
     if not float(share.max()):
-        raise UserError("the masks of the photographs have nothing in common: check masks, cameras")
+        raise UserError("the masks have nothing in common: check masks and cameras")
     coarse = around(first, share >= AROUND * share.max(), FIRST_VOXELS**3, 0)
     found = votes(shown, maps, coarse)
     share = in_box(share_of(found, len(masks)), coarse, box)
@@ -264,7 +263,7 @@ def find_object(
         raise nothing_inside(box, "masks and depth leave no shape", cameras)
     if not (inside > 0).any():
         raise UserError(
-            "the masks of the photographs are too faint or too few for any common shape"
+            "the masks of the photographs are too faint or too few to have a common shape"
         )
     return ObjectShape(grid, largest_part(inside), surface)
 

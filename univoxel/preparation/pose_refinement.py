@@ -1,5 +1,4 @@
-"""Cameras against silhouettes: whether they contradict one another, which of cameras and masks
-are believed, and how to put cameras right."""
+"""Silhouette-based pose refinement, and the choice between wrong cameras and wrong masks."""
 
 from __future__ import annotations
 
@@ -33,7 +32,7 @@ QUANTILE = 0.95
 MAX_CONTRADICTION = 0.25
 # Steps of Adam
 STEPS = 150
-# Learning rate at begin and end, radians and radii of the object
+# Learning rate at the start and the end, radians and radii of the object
 LR = (5e-3, 2.5e-4)
 # Rays of a step
 RAYS = 256
@@ -182,7 +181,7 @@ def align_(
 
 
 def _extended(distance: Tensor) -> Tensor:
-    """Distances [V, H, W] with what stands at the border of a picture beyond it too."""
+    """Distances [V, H, W] with what is at the border of a picture beyond it too."""
     if all(bool(d.isfinite().all()) for d in distance):
         return distance
     extended = memmap.zeros(distance.shape, distance.dtype)
@@ -212,8 +211,8 @@ def registered_poses(distance: Tensor, cameras: Cameras, box: tuple[Tensor, Tens
     moved = poses.moved(cameras).square().mean().sqrt()
     result = "agree"
     if rest > MAX_CONTRADICTION:
-        result = f"still contradict one another by {rest:.1f} pixels"
-    log.info("cameras moved the object by %.1f pixels on average: silhouettes %s", moved, result)
+        result = f"are still inconsistent by {rest:.1f} pixels"
+    log.info("camera poses refined by %.1f pixels on average: silhouettes %s", moved, result)
     return poses
 
 
@@ -228,13 +227,13 @@ def aligned_poses(
     return poses, contradiction(distance, poses.eval().corrected(cameras), box)
 
 
-# Cameras or masks: which are believed where silhouettes contradict one another.
+# Cameras or masks: which are believed where silhouettes are inconsistent.
 
 
 # Pixels of the median match, up to which cameras can be right: those of structure from motion are
 # off by 0.2 to 0.8, those that are off by more are worth refining
 MAX_DISTANCE = 1.0
-# How many times further silhouettes contradict one another where masks are to blame: cameras
+# How many times further silhouettes are inconsistent where masks are to blame: cameras
 # that are off make both large, the contradiction up to twice as much as the distance
 DOUBT = 4.0
 # Share of the contradiction that cameras which are refined leave at most, if it was their fault:
@@ -249,7 +248,7 @@ class Belief:
     box: tuple[Tensor, Tensor]  # corners [3], [3] around the object
     refined: bool  # whether the cameras are refined
     votes: int = 1  # views that have to carve a node, >= 1; more than one where masks are doubted
-    off: float = 0.0  # pixels, >= 0, that doubted masks contradict one another by; may be infinite
+    off: float = 0.0  # pixels, >= 0, that doubted masks are inconsistent by; may be infinite
 
 
 def choose_masks_or_poses(
@@ -260,14 +259,14 @@ def choose_masks_or_poses(
 ) -> Belief:
     """The box around the object, and which of cameras and masks are believed.
 
-    Where silhouettes contradict one another, points matched between photographs are asked. If they
+    Where silhouettes are inconsistent, points matched between photographs are asked. If they
     lie much nearer to where the cameras put them than the contradiction is large, it is the masks
     that are wrong. Of plain objects no points are matched: then cameras are to blame if silhouettes
     agree once they are refined.
 
     Args:
         distance: [V, H, W] from `hull.mask_distances`.
-        wanted, masks: as of the configuration.
+        wanted, masks: as in the configuration.
 
     Raises:
         UserError: the silhouettes share no volume.
@@ -300,7 +299,7 @@ def choose_masks_or_poses(
 
 
 def masks_or_poses_as_told(photos: Photos, distance: Tensor, wanted: CamerasFrom) -> Belief:
-    """`choose_masks_or_poses` where there is no time to ask: single masks may be wrong, cameras are
+    """`choose_masks_or_poses` if there is no time to ask: single masks may be wrong, cameras are
     right.
 
     Raises:
@@ -333,16 +332,16 @@ def _widened(
 
 
 def _say(seen: Agreement | None, off: float, believed: bool, refined: bool) -> None:
-    contradicting = f"silhouettes contradict one another by {off:.1f} pixels"
+    contradicting = f"silhouettes are inconsistent by {off:.1f} pixels"
     if math.isinf(off):
-        contradicting = "silhouettes share no volume"
+        contradicting = "silhouettes have no common volume"
     if seen is None and believed:
-        contradicting += ", and no better with other cameras"
+        contradicting += ", and pose refinement does not help"
     if seen is not None:
-        lie = f"matched points lie {seen.median:.2f} pixels from where the cameras put them"
-        contradicting = f"{lie}{': cameras are believed' if believed else ''}; {contradicting}"
+        lie = f"epipolar error {seen.median:.2f} pixels"
+        contradicting = f"{contradicting}, {lie}"
     if believed and not refined:
-        then = "the masks are rough"
+        then = "the masks are taken to be rough; better masks improve the result"
     else:
-        then = "cameras are refined" if refined else "see cameras=refined"
+        then = "camera poses are refined" if refined else "try cameras=refined"
     log.info("%s: %s", contradicting, then, extra={"arguments": ("cameras",)})

@@ -1,4 +1,4 @@
-"""What masks, cameras and photographs say before the first gradient, in order."""
+"""The preparation of masks, cameras and photographs, in order."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def brightness_of(photos: Photos, sdf: Tensor, grid: GridShape) -> Brightness:
 
     Args:
         photos: V, their cameras where they are believed to be.
-        sdf: [X, Y, Z] world units, such as of the visual hull.
+        sdf: [X, Y, Z] world units, such as in the visual hull.
         grid: of the sdf.
     """
     seen = observe_hull(photos, sdf, grid, POINTS)
@@ -168,8 +168,7 @@ def say_clipped(photos: Photos) -> None:
     share = clipped_share(photos)
     if share > MUCH_CLIPPED:
         log.info(
-            "%.0f %% of the object's pixels are overexposed: they count as at least so bright; "
-            "shorter exposures would tell more",
+            "%.0f %% of the object is overexposed; detail is lost there. Expose darker next time",
             100 * share,
         )
 
@@ -188,7 +187,7 @@ def varying_and_gains(
         hull: [X, Y, Z] sdf of the visual hull, world units.
         grid: of the hull.
         varying: what is known to differ.
-        look: whether to find out if exposures do, where nothing is known to differ.
+        look: whether to find out if exposures do, where there is nothing known to differ.
     """
     if varying == "none" and not look:
         return varying, None
@@ -197,22 +196,20 @@ def varying_and_gains(
     stops = float(gains.square().mean().sqrt()) / math.log(2)
     if varying == "none":
         left = contradictions_left(seen) if stops >= MIN_STOPS else 1.0
-        log.debug(
-            "exposures: gains of %.2f stops leave %.2f of what halves contradict", stops, left
-        )
+        log.debug("exposures: gains of %.2f stops leave %.2f of the inconsistency", stops, left)
         if left > MOST_LEFT:
             return varying, None
         varying = "exposure"
         log.info(
-            "exposures differ by %.2f stops from photograph to photograph: a gain is learned for "
-            "each, see varying",
+            "exposures differ by %.2f stops between photographs: a gain is learned for each; "
+            "see varying",
             stops,
             extra={"arguments": ("varying",)},
         )
     return varying, gains
 
 
-PINNED = "hull that stays"  # a step
+PINNED = "frozen hull"  # a step
 
 
 def unhurried(step: str, needed: bool = False) -> bool:
@@ -266,7 +263,7 @@ def find_silhouettes(
     in_time = begins("masks")
     photos, distance = fitted_masks(given, cfg.masks if in_time else "given")
     try:
-        if begins("masks against cameras"):
+        if begins("consistency of masks and cameras"):
             belief = choose_masks_or_poses(photos, distance, cfg.cameras, cfg.masks)
         else:
             belief = masks_or_poses_as_told(photos, distance, cfg.cameras)
@@ -275,7 +272,7 @@ def find_silhouettes(
             found = doubt_masks(photos, distance, belief)
     except UserError as error:
         raise DataError(f"{cfg.data}: {error}") from None
-    # Rough masks that there was no time to mend are no measure of how sharp edges are
+    # Rough masks that there was no time to repair are no measure of how sharp edges are
     doubted, shape, edges_given = None, None, photos is given and belief.votes == 1
     if found is not None:
         doubted, shape = found.pixels, found.shape
@@ -291,7 +288,7 @@ def prepare(
 
     Args:
         cfg: its first stage says how many voxels the hull's grid has.
-        begins: as of `find_silhouettes`.
+        begins: as in `find_silhouettes`.
     """
     stage = cfg.stages[0]
     assert isinstance(stage, StageConfig)
@@ -328,7 +325,7 @@ def pinned_in(
     cfg: TrainConfig,
     begins: Callable[..., bool] = unhurried,
 ) -> PinnedHull | None:
-    """What `prepare` pinned, of a scene that goes on."""
+    """What `prepare` pinned, of a scene that continues."""
     stage = cfg.stages[0]
     assert isinstance(stage, StageConfig)
     light = scene.cfg

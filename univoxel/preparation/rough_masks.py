@@ -1,4 +1,4 @@
-"""Masks that contradict one another, held against the object that photographs and masks agree on.
+"""Correction of inconsistent masks with the shape that photographs and masks agree on.
 
 Where a mask and the object's silhouette differ by more than a jagged edge, nothing is known: the
 pixel tells neither of the object nor of emptiness. A part that was moved between photographs, such
@@ -69,12 +69,12 @@ def doubt_masks(photos: Photos, distance: Tensor, belief: Belief) -> Doubted:
     fill_(distance, photos, pixels)
     box = estimate_bounds(distance, cameras, belief.votes)
     off = contradiction(distance, cameras, box, pixels)
-    told = "what the others show; depth contradicts most masks, and is not asked"
+    told = "the other masks; depth contradicts most masks and is ignored"
     if shape.surface:
-        told = "what the others and the depth of the photographs show; depth shows "
+        told = "the other masks and the depth of the photographs, which covers "
         told += f"{shape.surface:.0%} of the surface"
     log.info(
-        "%.1f%% of the pixels are doubted, where a mask differs from %s",
+        "%.1f%% of the pixels are uncertain, because a mask differs from %s",
         *(100 * float(pixels.float().mean()), told),
     )
     votes = 1 if off <= MAX_CONTRADICTION else belief.votes

@@ -1,4 +1,4 @@
-"""What the photographs are of, told by depth alone: without masks or a network.
+"""Detection of the object from depth only, without masks or a network.
 
 Cameras look at the object. Planes that all of them and what they look at lie on one side of are
 its support, and walls behind it. What is left of the surface and hangs together around the middle

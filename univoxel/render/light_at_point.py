@@ -1,4 +1,4 @@
-"""The light that falls on one point of a trained scene, as a picture."""
+"""The light that reaches one point of a trained scene, as an image."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How good a reconstruction is, and what training minimises: plain functions of tensors."""
+"""Quality metrics and losses: plain functions of tensors."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def chamfer(points: Tensor, truth: Tensor) -> float:
 def spearman(a: Tensor, b: Tensor) -> float | None:
     """Rank correlation of two sets of N numbers, in [-1, 1], with mean ranks for equal ones.
 
-    None where one of the sets is all equal, or empty. Source: Spearman 1904.
+    None if one of the sets is all equal, or empty. Source: Spearman 1904.
     """
     _same_size("spearman", a, b)
     from scipy.stats import rankdata  # half a second, which every command would wait

@@ -1,5 +1,4 @@
-"""Points of the surface: what sees them, what they see, and what photographs and one map make of
-them."""
+"""Surface points with their observations in photographs, and their shading under one map."""
 
 from __future__ import annotations
 
@@ -243,7 +242,7 @@ class Mirrors:
 
 @dataclass(frozen=True)
 class MaterialLabels:
-    """What the joint solve has decided so far; replaced as it goes on."""
+    """What the joint optimisation has decided so far; replaced as it continues."""
 
     metal: Tensor  # [P] bool, which points are metal
     sun: Tensor | None = None  # [D, 3] what a sun adds to the log map, which else is smooth
@@ -270,7 +269,7 @@ def build_problem(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> 
     position, normal = surface_points(mesh, cfg.points, generator)
     observations = observe(position, normal, photos, tracer, offset)
     if not len(observations.view):
-        raise NoSurface("no photograph sees a point of the surface")
+        raise NoSurface("no surface point is seen in any photograph")
     direction = scene.sky.direction
     transport = trace(
         observations, tracer, mesh, vertex_color, direction, cfg.tracing, offset, generator
@@ -287,7 +286,7 @@ def has_one_light(scene: Scene, problem: JointProblem) -> bool:
 
 
 def turned_maps(scene: Scene, observations: Observations) -> TurnedMaps | None:
-    """The scene's map in the world of each photograph; None where it is the same for all."""
+    """The scene's map in the world of each photograph; None if it is the same for all."""
     turntable = scene.cfg.turntable
     if turntable is None or scene.sky is None:
         return None

@@ -1,5 +1,4 @@
-"""Pictures put together: contact sheets, spheres under a map, photographs made small, a scene's
-present state."""
+"""Composed images: contact sheets, spheres under a map, thumbnails, previews of a scene."""
 
 from __future__ import annotations
 
@@ -120,7 +119,7 @@ def _tile(picture: np.ndarray, width: int, height: int) -> Image.Image:
     return Image.fromarray(bytes_).resize((width, height), Image.Resampling.BOX)
 
 
-# A map of light as pictures: itself, and a grey and a mirror ball under it.
+# A map of light as pictures: itself, and a grey and a chrome sphere under it.
 
 
 GREY = 0.5  # albedo of the ball
@@ -129,7 +128,7 @@ BLOCK = 64  # normals at a time: what each gets of every texel stays in the cach
 
 
 def map_and_balls(map: Tensor, height: int) -> list[Tensor]:
-    """A map, and a grey and a mirror ball under it, seen from +X: linear, `height` rows each."""
+    """A map, and a grey and a chrome sphere under it, seen from +X: linear, `height` rows each."""
     normal, inside = _ball(height)
     grey = torch.zeros(height, height, 3)
     grey[inside] = grey_ball(map, normal[inside])
@@ -166,7 +165,7 @@ def summed_light(map: Tensor) -> tuple[Tensor, Tensor]:
     return latlong_directions(rows).flatten(0, 1), pooled * (light[0].numel() / len(pooled))
 
 
-# Photographs as small as what stands beside them.
+# Photographs as small as what is beside them.
 
 
 def shrunk(photos: Photos, view: int, width: int, height: int) -> Tensor:

@@ -124,7 +124,7 @@ def radiance_of(
 
     Args:
         wo: [N, 3] unit, towards the eye.
-        view: as of `shade`.
+        view: as in `shade`.
     """
     surface, wo = in_light_frame(scene, surface, wo)
     encoded = scene.radiance(scene.coded(surface.features, view), surface.normal, wo)

@@ -1,5 +1,4 @@
-"""A surface under new light: paths until the noise is low, shadows on a floor, and the whole
-picture put together."""
+"""Relighting of a surface: path tracing to a noise level, shadows on a floor, compositing."""
 
 from __future__ import annotations
 
@@ -297,8 +296,8 @@ class Picture:
 
     rgb: Tensor  # [H, W, 3] on the background; premultiplied where that is transparent
     albedo: Tensor  # [H, W, 3] on black
-    normal: Tensor  # [H, W, 3] world, 0 where nothing is
-    depth: Tensor  # [H, W] along the camera's -Z, world units, 0 where nothing is
+    normal: Tensor  # [H, W, 3] world, 0 where there is nothing
+    depth: Tensor  # [H, W] along the camera's -Z, world units, 0 where there is nothing
     alpha: Tensor  # [H, W] of the object
     shadow: Tensor | None  # [H, W] what the floor loses of its light, where there is a floor
     metallic: Tensor | None  # [H, W] on black, where the scene has metal

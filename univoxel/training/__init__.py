@@ -1,1 +1,1 @@
-"""Training: the loop and its clock, the joint solve of light and materials, compression."""
+"""Training: the loop and its clock, the joint optimisation of light and materials, compression."""

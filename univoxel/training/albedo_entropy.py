@@ -1,4 +1,4 @@
-"""The light under which a surface has the fewest colours.
+"""The light under which the albedo has the lowest entropy.
 
 A diffuse point under one light shows its albedo times its irradiance, and neither alone. Under a
 map that is brighter above than it was, or that lacks a sun, shades and shadows become paint. But
@@ -109,8 +109,8 @@ class Sun:
         x, y, z = self.direction
         azimuth, elevation = math.degrees(math.atan2(y, x)), math.degrees(math.asin(z))
         return (
-            f"a sun sends {self.share:.0%} of the light, from about azimuth {azimuth:.0f}, "
-            f"elevation {elevation:.0f} degrees"
+            f"a sun at about azimuth {azimuth:.0f} and elevation {elevation:.0f} degrees sends "
+            f"{self.share:.0%} of the light"
         )
 
 
@@ -173,7 +173,7 @@ def sun_entropies(
     """Entropy of the albedos under an even sky with a sun: [K, D], by share and direction.
 
     Args:
-        overcast: [P, 3] irradiance over pi under the even sky alone.
+        overcast: [P, 3] irradiance over pi under the even sky only.
         power: [D, 3] radiance of a node that would send all of the light.
         shares: K, of the light that the sun sends.
     """

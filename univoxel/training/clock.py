@@ -1,4 +1,4 @@
-"""Steps of a training against its time."""
+"""The schedule of training steps under a time limit."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class Clock:
         """
         Args:
             begin: of reading the photographs, by `time.monotonic`.
-            state: as `state` gave it; empty at the begin of a run.
+            state: as `state` gave it; empty at the start of a run.
             slower: how many times as long a step takes here as on the machine of the estimates.
         """
         self.cfg: TrainConfig = cfg
@@ -115,7 +115,7 @@ class Clock:
         self.preparation: float = 0.0  # seconds that preparation is expected to end at
 
     def state(self) -> dict[str, Any]:
-        """What a later sitting needs to go on; JSON."""
+        """What a later sitting needs to continue; JSON."""
         return {
             "stage": self.stage,
             "progress": self.done,
@@ -325,7 +325,7 @@ class Clock:
         if not (short := self.short()):
             return ""
         stages = ", ".join(f"{made:.0%} for {name}" for name, made in short.items())
-        why = "this training was stopped" if self.finished else "time ended this training"
+        why = "the training was stopped" if self.finished else "the time limit ended the training"
         return f"{why} early: of the planned steps it made {stages}"
 
     def minutes_for_all(self) -> float:

@@ -1,5 +1,4 @@
-"""What makes a scene as small as it may be: what is chosen, when, what it costs, and what its
-file stores."""
+"""Compression of a scene: the choice of sizes, their cost in quality, and compact storage."""
 
 from __future__ import annotations
 
@@ -27,9 +26,9 @@ from univoxel.training.loop import batch_at
 from univoxel.training.pixels import TrainingPixels
 from univoxel.training.progress import CapacityChoice, chosen_reach, chosen_voxels
 
-# How small mirrored directions and hash tables may be: quality lost, and the search for sizes.
+# How small reflected directions and hash tables may be: quality lost, and the search for sizes.
 #
-# Quality is lost in dB: how much less well held-out pixels are drawn with a smaller model, by the
+# Quality is lost in dB: how much less well validation pixels are drawn with a smaller model, by the
 # physically based render and by the radiance head; or how far materials move, as if that were an
 # error of the same render.
 
@@ -276,7 +275,7 @@ REACH_TOLERANCE_DB = 0.05
 REACHES = (3.5, 3.0, 2.75, 2.5, 2.25, 2.0, 1.75, 1.5, 1.25, 1.0)
 # Share of the budget that bounds the rows of the hash table: the grid needs the rest
 TABLE_SHARE = 0.5
-# Share of the budget that the table of mirrored directions may have: it matters for gloss alone
+# Share of the budget that the table of reflected directions may have: it matters for gloss only
 MIRROR_SHARE = 0.1
 # Nodes of the next grid over those of the last, until a finished scene fits the budget. Each try
 # loses detail: small steps come closest to the budget
@@ -309,7 +308,7 @@ def check_budget(scene: Scene, budget_mb: float) -> None:
     least = _bytes_apart_from_grid(scene) + FEWEST_VOXELS // 2 * _node_bytes(scene)
     if 1e6 * budget_mb < least:
         raise UserError(
-            f"budget_mb: {budget_mb:g} is too small for anything: networks, map and the coarsest "
+            f"budget_mb: {budget_mb:g} is too small: networks, environment map and the coarsest "
             f"grid need {least / 1e6:.2g}",
             "budget_mb",
         )
@@ -335,7 +334,7 @@ def table_rows(scene: SceneConfig, budget_mb: float | None) -> int:
 
 
 def mirror_levels(scene: SceneConfig, budget_mb: float | None) -> int:
-    """Levels of the table of mirrored directions: as many as its share of the budget has room
+    """Levels of the table of reflected directions: as many as its share of the budget has room
     for."""
     if budget_mb is None:
         return scene.mirror_levels

@@ -1,5 +1,4 @@
-"""How every stage descends: gradients of a surface smoothed, steps dropped whose numbers fail,
-an end where held-out rays improve no more."""
+"""The optimiser of every stage: smoothed gradients, recovery from failed steps, early stopping."""
 
 from __future__ import annotations
 
@@ -25,7 +24,7 @@ EPS_SDF, EPS_FEATURES = 1e-4, 1e-8
 def smooth_sdf_gradient_(field: Field, passes: int) -> None:
     """Diffuse the sdf's gradient over the nodes that it touches, before Adam sees it: the surface
     then moves in large pieces, far and without the bumps that steps of single nodes leave. Nodes
-    that are pinned get none."""
+    that are frozen get none."""
     grad = field.sdf.grad
     assert grad is not None
     rows, pinned = rows_of(grad), field.distances.pinned
@@ -51,9 +50,9 @@ def smooth_touched_(field: Field, stage: StageConfig, every: int) -> None:
 # Holds a training where its numbers fail: drops the step, goes back to a good state, says so.
 
 
-FAR = 6.0  # dB below its best at which held-out quality has collapsed: four times the error
+FAR = 6.0  # dB below its best at which validation PSNR has collapsed: four times the error
 ENOUGH = 40.0  # dB; a best beyond counts as this: falls from there are no collapse
-LIMIT = 3  # failures in a row that are mended; the next one ends the stage
+LIMIT = 3  # failures in a row that are repaired; the next one ends the stage
 PROOF = 50  # sound steps after which a failure is over
 COPYING = 0.002  # share of the time that copies of the parameters may take
 
@@ -127,7 +126,7 @@ class Guard:
         return False
 
     def judge(self, psnr: float, kind: bool) -> None:
-        """Note quality on held-out rays, dB; go back if it has collapsed, else keep the state.
+        """Note quality on validation pixels, dB; go back if it has collapsed, else keep the state.
 
         Args:
             kind: what the quality is of; that of the other kind says nothing of it.
@@ -136,9 +135,7 @@ class Guard:
             self._best, self._kind = -math.inf, kind
         if not psnr > self._best - FAR:  # NaN too
             best = f", {self._best:.1f} dB at best" if math.isfinite(self._best) else ""
-            self._fail(
-                f"held-out quality is {psnr:.1f} dB{best}", True, "there is no state to go back to"
-            )
+            self._fail(f"validation PSNR is {psnr:.1f} dB{best}", True, "there is no earlier state")
             return
         self._best = min(max(self._best, psnr), ENOUGH)
         if psnr > self._best - FAR / 2:
@@ -166,16 +163,16 @@ class Guard:
         where = f"stage {self._progress.clock.stage + 1}, step {self._progress.clock.step}: {what}"
         if self._failures > LIMIT:
             self._progress.trouble(
-                f"{where}; {LIMIT} smaller steps did not help: the stage ends with the last state "
-                "that was good"
+                f"{where}; {LIMIT} smaller step sizes did not help: the stage ends with the last "
+                "good state"
             )
             self._progress.clock.abandon()
             return
-        done = "went back to the last good state" if back else otherwise
-        self._progress.trouble(f"{where}; {done}, steps are {self.scale:g} times as long from here")
+        done = "returned to the last good state" if back else otherwise
+        self._progress.trouble(f"{where}; {done}, step size now times {self.scale:g}")
 
 
-# When held-out rays do not improve any more.
+# When validation pixels do not improve any more.
 
 
 CHECK = 0.05  # of a stage's schedule, between looks

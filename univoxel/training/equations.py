@@ -1,4 +1,4 @@
-"""Gauss-Newton on the light of photographs: the normal equations that newton.py solves."""
+"""Normal equations of Gauss-Newton on the environment map, which newton.py solves."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class ViewDifferences:
 
 
 def view_differences(scene: Scene) -> ViewDifferences | None:
-    """Those of the scene's photographs; None where they all have one light."""
+    """Those of the scene's photographs; None if they all have one light."""
     views = scene.views
     if views is None:
         return None
@@ -38,7 +38,7 @@ class LinearTransport:
                       + specular_pv . map + specular_indirect_pv
 
     The base colour is the albedo: of a dielectric it multiplies the irradiance, [P, 1, D], which
-    the observations share; of a metal the mirrored light, [P, V, D].
+    the observations share; of a metal the reflected light, [P, V, D].
     """
 
     diffuse: Tensor  # map into what the base multiplies: cosine, visibility, solid angle, BRDF

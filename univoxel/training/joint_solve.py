@@ -1,4 +1,4 @@
-"""One environment map, albedo and roughness from the photographs, with traced visibility.
+"""Joint optimisation of one environment map, albedo and roughness, with traced visibility.
 
 Local lobes explain every photograph and leave shadows in the albedo. Once geometry stands, the
 light is known to be one distant map that reaches a point where nothing is in the way, and what is
@@ -78,7 +78,7 @@ TEACHING_WEIGHT = 0.1
 ALBEDO_SMOOTHNESS = 0.005
 # Weight of the change of the roughness there
 ROUGHNESS_SMOOTHNESS = 0.02
-# Weight of the cross entropy of metallic and the metal decision
+# Weight of the cross entropy of metallic and the metal classification
 METALLIC_WEIGHT = 0.01
 
 
@@ -248,8 +248,8 @@ def start_(
         progress.trouble(trouble)
     if decisions.only_metal and cfg.only_metal is None:
         progress.say(
-            "the whole object is taken for metal: that explains the photographs about as well as "
-            "anything else; see --metal"
+            "the whole object is classified as metal, because that explains the photographs "
+            "about as well as anything else; if it is not, use --metal some"
         )
     if not cfg.colors:
         return decisions

@@ -1,4 +1,4 @@
-"""The training loop, and what it minimises."""
+"""The training loop and its losses."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ COMPARED = 4
 SHARPNESS_FACTORS = (0.7, 0.85, 1.0, 1.2, 1.4, 1.7, 2.0)
 MIN_OPACITY = 0.5  # rays that meet less are not shaded: their surface is a silhouette's fringe
 
-# Rate of cameras that are refined, at the begin and the end of a stage: radians, radii
+# Rate of cameras that are refined, at the start and the end of a stage: radians, radii
 LR_POSES = (1e-3, 1e-4)
 # Weights of how much materials change over about a voxel, L1
 ALBEDO_SMOOTHNESS, ROUGHNESS_SMOOTHNESS = 0.005, 0.02
@@ -159,7 +159,7 @@ def add_gradient_(table: Tensor, gradient: Tensor | None) -> None:
 
 
 def restore_surface_(scene: Scene) -> None:
-    """After parameters went back: look anew at what follows from them, even if it is held."""
+    """After parameters went back: look again at what follows from them, even if it is held."""
     scene.field.refresh()
     scene.release_surface()
 
@@ -263,8 +263,8 @@ def smoothness_losses(
     """Weighted priors: material and light change little from points to places beside them.
 
     Args:
-        view: [N] as of `shade`.
-        draw, features: as of `losses_of`.
+        view: [N] as in `shade`.
+        draw, features: as in `losses_of`.
     """
     away = scene.field.voxel_size * torch.randn(met.position.shape, generator=draw)
     beside = met.position.detach() + away
@@ -302,7 +302,7 @@ def batch_at(photos: Photos, pixels: Tensor) -> Batch:
 
 @torch.no_grad()
 def fit_sharpness_(scene: Scene, pixels: TrainingPixels) -> None:
-    """Give the density the sharpness with which held-out pixels are drawn best.
+    """Give the density the sharpness with which validation pixels are drawn best.
 
     A stage ends with one that is even over the grid. How wide a silhouette's fringe has to be
     depends on the pixels too, and on how well masks and surface agree. Masks whose edges were

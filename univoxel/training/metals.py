@@ -1,4 +1,4 @@
-"""Which points of the surface are metal, and where the joint solve starts from."""
+"""Metal classification of surface points, and the initialisation of the joint optimisation."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def fitted(constant: Tensor, slope: Tensor, target: Tensor, min_brightest: float
     return CAUCHY**2 * torch.log1p(linearised()[1]).mean((1, 2)) + 1e-6
 
 
-# Where the joint solve starts from: roughness and metal under no map yet, by trial.
+# Where the joint optimisation starts from: roughness and metal under no map yet, by trial.
 
 
 # Points of a round. Of a third of them residuals scatter more than they differ
@@ -276,7 +276,7 @@ def initialise_(
 def neutralise_(scene: Scene, problem: JointProblem) -> None:
     """Make the map grey in the mean, and the albedo as bright as that of metals.
 
-    Of an object all of metal photographs show the product of map and albedo alone: in each channel
+    Of an object all of metal photographs show the product of map and albedo only: in each channel
     one may be brighter and the other darker.
     """
     features = scene.field.features_at(problem.observations.position)

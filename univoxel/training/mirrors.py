@@ -1,4 +1,4 @@
-"""Metals that mirror their surroundings, found by how much they change from view to view."""
+"""Detection of metals that reflect their surroundings sharply, by changes between views."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from univoxel.training.newton import NODE_NEIGHBOURS
 # A mirror shows the map sharper than its nodes lie apart, and through normals that are off by many
 # degrees. So neither material fits, and residuals do not tell them apart. But how much a point
 # changes from view to view does not depend on where exactly it mirrors: of metal it is about as
-# much as the map changes between the mirrored directions, of paint a part of that.
+# much as the map changes between the reflected directions, of paint a part of that.
 
 
 # Observations of a point that are compared
@@ -77,7 +77,7 @@ class MirrorObservations:
     normal: Tensor  # [N, 3]
     wo: Tensor  # [N, V, 3]
     color: Tensor  # [N, V, 3] linear
-    open: Tensor  # [N, V] bool: the sky is where the mirrored direction points, and around it
+    open: Tensor  # [N, V] bool: the sky is where the reflected direction points, and around it
 
     @property
     def encoded(self) -> Tensor:

@@ -58,7 +58,7 @@ MIN_PARTS = 2
 
 
 NEWTON_CHUNK = 256  # points whose equations are built at once
-UNSOLVABLE = "the equations for the map have no solution: it stays as it is in this round"
+UNSOLVABLE = "the equations for the environment map have no solution: it stays for this round"
 
 
 @dataclass(frozen=True)
@@ -385,7 +385,7 @@ def flash_transport(
     problem: JointProblem, point: Tensor, observation: Tensor, roughness: Tensor, metal: bool
 ) -> Tensor | None:
     """Radiance [2, P, V, 3] that the flash makes points send, for base 1 and what does not depend
-    on it; None: there is no flash. Arguments as of `linear_transport`."""
+    on it; None: there is no flash. Arguments as in `linear_transport`."""
     flash = problem.flash
     if flash is None:
         return None

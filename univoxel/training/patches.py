@@ -35,7 +35,7 @@ MIN_ALPHA = 0.99  # of all pixels of a patch
 MIN_TEXTURE = 0.004  # standard deviation of brightness: about that of rounding to bytes
 NOISE = 0.001  # brightness; patches that vary less correlate less
 # Of what correlation lacks to 1, above which a view pulls no more: something else is seen there, a
-# highlight or what stands before it
+# highlight or what is before it
 MOST = 0.3
 
 
@@ -71,7 +71,7 @@ def disagreement(
 
     Args:
         scene: whose surface hides points from views.
-        brightness: of the photographs, as of `comparable`.
+        brightness: of the photographs, as in `comparable`.
         cameras: of them; they get no gradient.
         surface: [N] what rays of the photographs' pixels meet.
         wo: [N, 3] unit, towards the eye.
@@ -135,7 +135,7 @@ def views_beside(
     points too [N, K] bool; those that do come first.
 
     Args:
-        matrices: [V, 3, 4] as of `projection_matrices`.
+        matrices: [V, 3, 4] as in `projection_matrices`.
     """
     towards = normalize(cameras.camera_to_world[:, :, 3] - position[:, None], dim=-1)  # [N, V, 3]
     turned = (towards * towards[torch.arange(len(view)), view][:, None]).sum(-1)

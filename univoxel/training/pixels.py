@@ -1,4 +1,4 @@
-"""Which pixels of the photographs training looks at, and the memory that it will need."""
+"""The pixels that training uses, and the memory that it needs."""
 
 from __future__ import annotations
 
@@ -153,14 +153,14 @@ def check_memory(photos: Photos, cfg: TrainConfig, there: Memory | None = None) 
     factor = _factor(photos, further, left)
     what = (
         f"training on {len(photos)} photographs of {photos.cameras.width}x{photos.cameras.height} "
-        f"pixels needs about {(further + have) / 1e9:.1f} GB, of {there.total / 1e9:.1f} GB "
-        f"{left / 1e9:.1f} are free"
+        f"pixels needs about {(further + have) / 1e9:.1f} GB; {left / 1e9:.1f} of "
+        f"{there.total / 1e9:.1f} GB are free"
     )
     change = f"downscale={factor}" if factor else "preset=draft"
     if further + have > there.total:
         raise UserError(f"{what}: pass {change}", "downscale", "preset")
     log.warning(
-        "%s: if it is ended by the system, pass %s or close other programs",
+        "%s: if the system ends it, pass %s or close other programs",
         *(what, change),
         extra={"arguments": ("downscale", "preset")},
     )

@@ -1,4 +1,4 @@
-"""How fast this machine makes steps, measured: before a training says how long it will take."""
+"""Measures the speed of this machine, to predict the time of a training."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""What a training tells of itself: bar, log, messages, the state that it is saved with, and what
-compression chose."""
+"""Progress of a training: bar, log, messages, saved state, and choices of compression."""
 
 from __future__ import annotations
 
@@ -29,7 +28,7 @@ class CapacityChoice:
     kind: Kind
     before: float  # size; of a reach in voxels, else a count
     after: float
-    cost: float  # dB that held-out rays lost; below 0 they gained
+    cost: float  # dB that validation pixels lost; below 0 they gained
     why: str
 
     @property
@@ -56,13 +55,13 @@ class CapacityChoice:
 
 
 def chosen_voxels(choices: Iterable[CapacityChoice]) -> int | None:
-    """Voxels of the coarsest grid that was chosen; None where none was."""
+    """Voxels of the coarsest grid that was chosen; None if none was."""
     counts = [round(choice.after) for choice in choices if choice.kind == "voxels"]
     return min(counts, default=None)
 
 
 def chosen_reach(choices: Iterable[CapacityChoice]) -> float | None:
-    """Voxels from the surface up to which nodes are stored, as chosen last; None where it was
+    """Voxels from the surface up to which nodes are stored, as chosen last; None if it was
     not."""
     reaches = [choice.after for choice in choices if choice.kind == "reach"]
     return reaches[-1] if reaches else None
@@ -112,7 +111,7 @@ class Listener(Protocol):
         ...
 
     def trouble(self, what: str) -> None:
-        """Tell of something that went wrong and was mended."""
+        """Tell of something that went wrong and was repaired."""
         ...
 
 
@@ -130,9 +129,9 @@ class Progress:
         """
         Args:
             begin: of reading the photographs, on the clock of `time.monotonic`.
-            state: as `state` gave it; empty at the begin of a run.
+            state: as `state` gave it; empty at the start of a run.
             on_progress: called with each report.
-            slower: as of `Clock`.
+            slower: as in `Clock`.
         """
         self.cfg: TrainConfig = cfg
         self.slower: float = slower
@@ -173,7 +172,7 @@ class Progress:
         self._show(f"preparation: {what}", "")
         if not needed and self.clock.hurried and not self._goes_on:
             self.skipped.append(what)
-            log.info(f"minutes leave no time to look at {what}", extra={"arguments": ("minutes",)})
+            log.info(f"minutes leave no time for {what}", extra={"arguments": ("minutes",)})
         return what not in self.skipped
 
     def prepared(self) -> None:
@@ -183,13 +182,13 @@ class Progress:
 
     def _show(self, what: str, facts: str) -> None:
         """Move the bar."""
-        times = f"{_clock(self.clock.seconds)} gone, {_clock(self.clock.remaining)} left "
+        times = f"{_clock(self.clock.seconds)} elapsed, {_clock(self.clock.remaining)} left "
         self._bar.update(
             self._task, completed=self.clock.share_done, description=what, facts=facts + times
         )
 
     def state(self) -> dict[str, Any]:
-        """What a later sitting needs to go on, and what evaluation reports; JSON."""
+        """What a later sitting needs to continue, and what evaluation reports; JSON."""
         return self.clock.state() | {
             "within": self.within,
             "chosen": [choice.as_json() for choice in self.chosen],
@@ -204,7 +203,7 @@ class Progress:
         log.info(what)
 
     def trouble(self, what: str) -> None:
-        """Tell, at once and in the log, of something that went wrong and was mended."""
+        """Tell, at once and in the log, of something that went wrong and was repaired."""
         self.troubles.append(what)
         nothing = {"losses": {}, "held_out_psnr": None, "rays_per_second": None}
         self._append(self.state() | nothing | {"trouble": what})
@@ -240,11 +239,8 @@ class Progress:
                 self._on_progress(TrainingProgress(*place, losses, psnr, rate))
         quality = "" if psnr is None else f"validation {psnr:.1f} dB  "
         if self.troubles:
-            quality += f"{len(self.troubles)} troubles  "
-        self._show(
-            f"{name} ({clock.stage + 1} of {len(self.cfg.stages)})",
-            f"loss {sum(losses.values()):.4f}  {quality}{rate / 1e3:.0f}k rays/s  ",
-        )
+            quality += f"recovered {len(self.troubles)} times  "
+        self._show(f"{name} ({clock.stage + 1} of {len(self.cfg.stages)})", quality)
 
 
 def _clock(seconds: float) -> str:

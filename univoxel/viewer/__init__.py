@@ -1,1 +1,1 @@
-"""A run in a browser, path traced while hands move the camera and the light."""
+"""The live viewer: a run in a browser, path traced during interaction."""

@@ -1,5 +1,4 @@
-"""Pictures of a subject: a quick one while something moves, better and better ones at rest,
-noise taken out."""
+"""Frames of the viewer: fast during motion, refined and denoised at rest."""
 
 from __future__ import annotations
 
@@ -49,7 +48,7 @@ def denoised(
 
     Args:
         rgb: [H, W, 3] linear.
-        albedo, normal: [H, W, 3], free of noise, 0 where there is no surface.
+        albedo, normal: [H, W, 3], free of noise, 0 if there is no surface.
         shadow: [H, W] in [0, 1].
     """
     import pyoidn  # pyright: ignore[reportMissingImports]  the extra `denoise`
@@ -92,7 +91,7 @@ class Look:
 
 @torch.no_grad()
 def quick_picture(subject: Subject, cameras: Cameras, look: Look) -> Tensor:
-    """View 0 with few samples, from the mesh alone: [H, W, 4] sRGB with straight alpha.
+    """View 0 with few samples, from the mesh only: [H, W, 4] sRGB with straight alpha.
 
     Raises:
         UserError: doubts are asked for, and the photographs are not there.

@@ -1,5 +1,4 @@
-"""Who gets the next picture: one thread renders for all clients, those who move first; and turns
-around the object."""
+"""The render thread, which serves moving clients first; and orbits around the object."""
 
 from __future__ import annotations
 
@@ -112,8 +111,8 @@ class Studio:
             except (UserError, OSError) as error:
                 self._give_up(viewer, chore, str(error))
             except Exception:
-                log.exception("a picture failed")  # a fault of the program: its traceback
-                self._give_up(viewer, chore, "a picture failed: the program's log says more")
+                log.exception("rendering failed")  # a fault of the program: its traceback
+                self._give_up(viewer, chore, "rendering failed: see the log of the program")
 
     def _next(self, turn: int) -> tuple[Viewer, str | None] | None:
         """The viewer whose turn it is, and its chore, if not its view; None: all are served."""

@@ -1,4 +1,4 @@
-"""A run in browsers: viser's page around our pictures. Each client has a view and light of its own.
+"""The viewer's server, built on viser. Each client has its own view and light.
 
 viser draws the controls and moves the camera; the picture stands behind its empty scene.
 """
@@ -49,7 +49,7 @@ from univoxel.viewer.viewer_scene import (
     point_on_mesh,
 )
 
-DARK = "no map"  # the light that leaves the sun alone
+DARK = "no map"  # the light that leaves the sun only
 PLAIN = 0.16  # sRGB, behind a transparent picture
 JPEG = 90  # quality of pictures that are sent
 MAPS = (".hdr", ".exr")
@@ -133,7 +133,7 @@ class Panel:
         self._map.on_upload(lambda event: self._guarded(self._take_map))
         gui.add_button("PNG").on_click(lambda event: self._guarded(self._send_png))
         gui.add_button("GLB").on_click(lambda event: self._guarded(self._send_glb))
-        self._film = gui.add_button("turntable", hint="a turn around the object as MP4 or GIF")
+        self._film = gui.add_button("turntable", hint="an orbit around the object as MP4 or GIF")
         self._film.on_click(lambda event: self._make_film())
         self._progress = gui.add_progress_bar(0.0, visible=False)
         nothing = np.zeros((3 * ROWS, 6 * ROWS, 3), np.uint8)
@@ -182,7 +182,7 @@ class Panel:
         room = 0.02 * (high - low).norm()
         low, high = low - room, high + room
         self._boxed = gui.add_checkbox(
-            "box", False, hint="drag its two corners; click on the object to end it there, below"
+            "box", False, hint="drag its corners; click on the object to move its bottom there"
         )
         self._option = gui.add_markdown("", visible=False)
         self._corners = [

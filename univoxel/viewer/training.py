@@ -1,4 +1,4 @@
-"""A training in browsers, as it goes, and the server that pages of one machine see."""
+"""A training in the browser while it runs, and the server with its access rules."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def hosted(host: str, port: int, title: str) -> Iterator[Any]:
     with _silent():
         server = viser.ViserServer(host=host, port=port, verbose=False)
     try:
-        if port and server.get_port() != port:  # taken in between; viser goes on to the next
+        if port and server.get_port() != port:  # taken in between; viser continues to the next
             raise _taken(host, port)
         _guard(server, host)
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
@@ -65,10 +65,10 @@ def address_of(server: Any, host: str) -> str:
 
 
 def _guard(server: Any, host: str) -> None:
-    """Answer pages of this server alone, and tell nobody outside of it."""
+    """Answer pages of this server only, and tell nobody outside of it."""
 
     def refused(*args: Any, **options: Any) -> None:
-        log.warning("a page asked to share the viewer with the network: refused")
+        log.warning("refused: a page asked to share the viewer with the network")
 
     server.request_share_url = refused  # would open a tunnel to a host outside
     inner = server._websock_server
@@ -78,7 +78,7 @@ def _guard(server: Any, host: str) -> None:
         websocket = inner._live_connections[connection.client_id]
         headers = websocket.request.headers
         if not same_site(headers.get("Origin"), headers.get("Host"), host):
-            log.warning("a page of %s asked for the viewer: refused", headers.get("Origin"))
+            log.warning("refused: a page of %s asked for the viewer", headers.get("Origin"))
             await websocket.close(1008, "another site")
 
 
@@ -105,7 +105,7 @@ def _require_port(host: str, port: int) -> None:
 
 def _taken(host: str, port: int) -> UserError:
     return UserError(
-        f"{host}:{port} is taken or cannot be listened on; give another port, or 0 for a free one",
+        f"{host}:{port} is in use or not available; pass another port, or 0 for any free one",
         "port",
     )
 
@@ -126,7 +126,7 @@ def _silent() -> Iterator[None]:
 SIZE = 192  # pixels along a picture, at most
 EVERY = 3.0  # seconds between pictures, at least
 SHARE = 0.05  # of the time that pictures may take; the longer one takes, the rarer they are
-ENDING = "Ending early: what is left is hurried through."
+ENDING = "Ending early: the remaining stages are shortened."
 BEHIND = 32  # of 255, around the pictures
 
 
@@ -138,7 +138,7 @@ def watched(host: str, port: int, title: str) -> Iterator[Spectators]:
         MissingExtra: viser is not installed.
         UserError: the port is taken.
     """
-    with hosted(host, port, f"{title}, in training") as server:
+    with hosted(host, port, f"{title}, training") as server:
         # Beside the picture; not every viser has it
         if panel := getattr(server.gui, "main_panel", None):
             panel.dock_right()
@@ -161,11 +161,11 @@ class Spectators:
         self._qualities: list[list[tuple[float, float]]] = []
         self._ends: list[float] = []
         gui = server.gui
-        self._status = gui.add_markdown("Reading photographs, and preparing.")
+        self._status = gui.add_markdown("Reading and preparing photographs.")
         self._share = gui.add_progress_bar(0.0)
         self._choice = gui.add_dropdown("photograph", ("",), initial_value="")
         self._curves = gui.add_html("")
-        button = gui.add_button("end training, keep the result", color="red")
+        button = gui.add_button("end training and keep the result", color="red")
         self._choice.on_update(lambda event: self._hasten())
         button.on_click(lambda event: self.stop())
 
@@ -187,7 +187,7 @@ class Spectators:
         and somebody looks. The scene and the random numbers stay as they are."""
         if self._asked.is_set() and not clock.finished:
             clock.finish()
-            log.info("training is ended early: what is left is hurried through")
+            log.info("training is ended early: the remaining stages are shortened")
         if self._failed or time.monotonic() < self._next:
             return
         begin = time.monotonic()
@@ -213,7 +213,7 @@ class Spectators:
                 self._qualities[-1].append((now.seconds, now.held_out_psnr))
             curves = (
                 Curve("loss", self._losses, logarithmic=True),
-                Curve("validation, PSNR in dB", self._qualities),
+                Curve("validation PSNR, dB", self._qualities),
             )
             self._curves.content = "".join(chart(curve, self._ends) for curve in curves)
             self._share.value = 100 * now.share
@@ -236,7 +236,7 @@ class Spectators:
             try:
                 client.scene.set_background_image(fitted(picture, client.camera.aspect))
             except Exception as error:  # gone in between, or broken: its own affair
-                log.debug("a browser was not reached: %s", error)
+                log.debug("a browser could not be reached: %s", error)
 
     def _clients(self) -> Mapping[int, Any]:
         return self._server.get_clients()
@@ -251,10 +251,10 @@ class Spectators:
         try:
             yield
         except UserError as error:  # such as no surface yet
-            log.debug("no picture of the training: %s", error)
+            log.debug("no image of the training: %s", error)
         except Exception:
             self._failed = True
-            log.exception("the view of the training failed and shows no more; training goes on")
+            log.exception("the view of the training failed and is closed; training continues")
 
 
 def words(now: TrainingProgress, asked: bool) -> str:

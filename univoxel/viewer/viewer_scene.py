@@ -1,5 +1,4 @@
-"""What a viewer shows: the scene, its mesh with materials, what photographs say of it, and the
-light at a point."""
+"""The contents of the viewer: scene, mesh with materials, photographs, and the light at a point."""
 
 from __future__ import annotations
 
@@ -68,7 +67,7 @@ class Subject:
 
 
 def subject_of(run: Path) -> Subject:
-    """The scene of a run's folder, and its mesh; a UserError where there is none."""
+    """The scene of a run's folder, and its mesh; a UserError if there is none."""
     scene = load_scene(run)
     mesh = mesh_of(scene, cameras=cameras_of(scene, run))
     return Subject(scene, traced_mesh(mesh, scene.field.voxel_size), run)
@@ -78,7 +77,7 @@ def mesh_of(scene: Scene, faces: int = FACES, cameras: Cameras | None = None) ->
     """The surface with at most so many triangles, materials and normals at its vertices.
 
     Args:
-        cameras: as of `surface_of`.
+        cameras: as in `surface_of`.
     """
     return with_materials(scene, simplify(surface_of(scene, cameras), faces))
 
@@ -147,7 +146,7 @@ def incident_light(
 ) -> Tensor:
     """Radiance that arrives at a point from everywhere, linear: [rows, 2 rows, 3].
 
-    Texels are directions as of environment maps. From where the mesh is in the way comes what that
+    Texels are directions as in environment maps. From where the mesh is in the way comes what that
     part of it reflects; from below the horizon comes nothing. A sun is a texel of its irradiance.
     Point lights are left out.
     """

@@ -156,7 +156,7 @@ def test_pictures_differ_in_exposure_and_light_by_seed(scene, tmp_path):
     assert share == pytest.approx(random().uniform(size=6), abs=0.03)
     few = damaged(scene, tmp_path / "few", Damage(views=2, light=1.0), 0, second)
     assert len(load_photos(few, "train")) == 2
-    with pytest.raises(ValueError, match="light above 0 needs a scene in a second light"):
+    with pytest.raises(ValueError, match="light above 0 needs a scene under a second light"):
         damaged(scene, tmp_path / "x", dark)
     with pytest.raises(ValueError, match="expected 9 photographs, got 6"):
         damaged(scene, tmp_path / "x", Damage(views=9))

@@ -199,7 +199,7 @@ def test_what_is_written_is_what_our_loaders_read(tmp_path):
 
 
 def test_a_hidden_part_casts_no_truth():
-    """The foot of the ball stands in the ring's hole: the nearest surface counts."""
+    """The foot of the ball is in the ring's hole: the nearest surface counts."""
     spec = SPECS["figure"]
     parts = scenes.parts_of(spec)
     cameras = scenes.test_cameras(spec)

@@ -58,7 +58,7 @@ def test_trainings_are_by_steps(light):
 
 
 def test_colors_tell_of_the_light_as_in_longer_presets():
-    """They found suns until draft, whose trainings are made small here, left them alone."""
+    """They found suns until draft, whose trainings are made small here, left them only."""
     config = suite.setting("hybrid", 0, AXES["sun"].levels[1]).config(Path("photos"), Path("run"))
     (joint,) = (s for s in config.stages if isinstance(s, JointConfig))
     assert joint.colors
