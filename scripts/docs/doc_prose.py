@@ -13,7 +13,7 @@ from pathlib import Path
 import doc_blocks
 
 COLUMNS = 100
-README_LINES = 100
+README_LINES = 120
 
 # Where numbers with units may stand anywhere: a history, and mathematics
 FREE = (

@@ -20,6 +20,7 @@ from typing import Any
 
 NVS = ("novel views, dB", "nvs_psnr", 1)
 ALBEDO = ("albedo, dB", "albedo_psnr_3ch", 1)
+MASKED = ("albedo in the mask, dB", "albedo_psnr_fg", 1)
 ROUGHNESS = ("roughness MSE", "roughness_mse", 4)
 RELIT = ("relit, dB", "relit_psnr", 1)
 NORMALS = ("normals, degrees", "normal_mae_deg", 1)
@@ -41,6 +42,8 @@ def block(name: str, results: Path) -> str:
     check_one_version(record)
     if missing := [key for key in ("date", "commit") if not record.get(key)]:
         raise ValueError(f"{file}: has no {' and no '.join(missing)}")
+    if beside := BESIDE.get(name):
+        record |= {"beside": json.loads((results / beside).read_text(encoding="utf-8"))}
     if kind := KINDS.get(name) or KINDS.get(file):
         made = f"*{version(record)}.*"
         return kind(record, part) if part == "small" else f"{made}\n\n{kind(record, part)}"
@@ -145,11 +148,11 @@ def _scene(name: str) -> str:
 
 
 def _chart(record: dict[str, Any], part: str) -> str:
-    """The presets on three scenes; `small` for the README."""
-    columns = (SECONDS, NVS, ALBEDO, RELIT, NORMALS)
-    if part != "small":
-        columns = (*columns[:3], ROUGHNESS, *columns[3:], MEMORY, ("file, MB", "mb", 1))
-        columns = (*columns, ("steps made, %", "steps", 0))
+    """The presets on three scenes; `small` for the README, beside what `baked` gives."""
+    if part == "small":
+        return _beside_baked(record)
+    columns = (SECONDS, NVS, MASKED, ALBEDO, ROUGHNESS, RELIT, NORMALS, MEMORY)
+    columns = (*columns, ("file, MB", "mb", 1), ("steps made, %", "steps", 0))
     runs = [
         (
             (_scene(p["scene"]), f"`{p['setting']}`"),
@@ -160,16 +163,32 @@ def _chart(record: dict[str, Any], part: str) -> str:
             },
         )
         for p in record["points"]
-        if part != "small" or p["setting"] == "fast"
     ]
-    keys = ("scene", "preset")
-    if part == "small":
-        return measured([((names[0],), m) for names, m in runs], keys[:1], columns)
-    return measured(runs, keys, columns)
+    return measured(runs, ("scene", "preset"), columns)
+
+
+def _beside_baked(record: dict[str, Any]) -> str:
+    """`fast` on each scene, and the albedo and relit pictures of a training without light."""
+    rows = record["beside"]["rows"]
+    baked = {r["scene"]: r["measures"] for r in rows if r["setting"] == "baked"}
+    columns = (
+        *(SECONDS, NVS, NORMALS, ("albedo, dB", "albedo_psnr_fg", 1)),
+        *(("baked albedo, dB", "baked_albedo", 1), RELIT, ("baked relit, dB", "baked_relit", 1)),
+    )
+    runs = []
+    for p in record["points"]:
+        if p["setting"] == "fast":
+            other = baked[p["scene"]]
+            other = {
+                "baked_albedo": other["albedo_psnr_fg"],
+                "baked_relit": other["relit_psnr"],
+            }
+            runs.append(((_scene(p["scene"]),), p["measures"] | other))
+    return measured(runs, ("scene",), columns)
 
 
 def _lights(record: dict[str, Any], _: str) -> str:
-    columns = (SECONDS, NVS, ALBEDO, ROUGHNESS, RELIT, NORMALS, MEMORY)
+    columns = (SECONDS, NVS, MASKED, ALBEDO, ROUGHNESS, RELIT, NORMALS, MEMORY)
     columns += (("grey ball, dB", "map_ball_psnr", 1),)
     columns += (("brightest direction, degrees off", "map_brightest_degrees", 1),)
     runs = [((_scene(r["scene"]), f"`{r['setting']}`"), r["measures"]) for r in record["rows"]]
@@ -456,6 +475,9 @@ def _relight_runs(record: dict[str, Any], part: str) -> str:
             rows.append([_scene(scene) + power, *[number(at[b], 2) for b in bounces]])
     return table(["relit, dB, by bounces", *map(str, bounces)], rows)
 
+
+# Blocks that show a second file: functions find it under "beside" in the record
+BESIDE = {"chart.json:small": "lights.json"}
 
 KINDS: dict[str, Callable[[dict[str, Any], str], str]] = {
     "chart.json": _chart,
