@@ -106,8 +106,13 @@ def main(run: Path, out: Path) -> None:
         strip.paste(panel, (2 * SIDE, 0))
         frames.append(strip)
     frames[0].save(
-        out / "tankard.webp", save_all=True, append_images=frames[1:], duration=90, loop=0,
-        quality=78, method=6,
+        out / "tankard.webp",
+        save_all=True,
+        append_images=frames[1:],
+        duration=90,
+        loop=0,
+        quality=78,
+        method=6,
     )
 
 
