@@ -127,7 +127,9 @@ def scene_mesh(cells: int) -> tuple[Mesh, int]:
     rim = 3 * torch.stack([around.cos(), around.sin(), 0 * around], 1)
     table = torch.cat([torch.zeros(1, 3), rim])
     first = len(vertices)
-    fan = torch.stack([torch.zeros(64).long(), torch.arange(64) + 1, (torch.arange(64) + 1) % 64 + 1], 1)
+    fan = torch.stack(
+        [torch.zeros(64).long(), torch.arange(64) + 1, (torch.arange(64) + 1) % 64 + 1], 1
+    )
     albedo, roughness = paint(vertices)
     everything = torch.cat([vertices, table])
     return (
@@ -148,7 +150,7 @@ def normals(p: torch.Tensor) -> torch.Tensor:
 
 
 def walk(photographs: int, width: int, height: int) -> Cameras:
-    """Cameras of somebody who walks around the table twice, the second time with raised arms."""
+    """Cameras of somebody who walks around the table, every third time with raised arms."""
     random = np.random.default_rng(5)
     poses = []
     for k in range(photographs):
@@ -156,14 +158,14 @@ def walk(photographs: int, width: int, height: int) -> Cameras:
         angle = 2 * math.pi * k / photographs + random.normal(0, 0.03)
         up = math.radians(random.normal(52 if high else 24, 2))
         away = random.normal(2.65, 0.06)
-        place = away * np.array(
-            [math.cos(angle) * math.cos(up), math.sin(angle) * math.cos(up), math.sin(up)]
-        )
+        level = math.cos(up)
+        place = away * np.array([math.cos(angle) * level, math.sin(angle) * level, math.sin(up)])
+        place[2] += 0.5  # of the bird's middle above the table
         target = np.array([0.02, 0.0, 0.5]) + random.normal(0, 0.03, 3)
-        back = (place + [0, 0, 0.5] - target) / np.linalg.norm(place + [0, 0, 0.5] - target)
+        back = (place - target) / np.linalg.norm(place - target)
         right = np.cross([0, 0, 1], back)
         right /= np.linalg.norm(right)
-        poses.append(np.stack([right, np.cross(back, right), back, place + [0, 0, 0.5]], 1))
+        poses.append(np.stack([right, np.cross(back, right), back, place], 1))
     focal = FOCAL_35MM / 43.27 * math.hypot(width, height)
     return Cameras(
         torch.tensor(np.stack(poses)).float(),
@@ -178,7 +180,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="render the photographs of the tutorial")
     parser.add_argument("out", type=Path, help="folder for IMG_0001.jpg and so on")
     parser.add_argument("--masks", type=Path, help="folder for a perfect mask of each photograph")
-    parser.add_argument("--photographs", type=int, default=40)
+    parser.add_argument("--photographs", type=int, default=40, help="all around")
+    parser.add_argument("--first", type=int, help="take only this many of them")
     parser.add_argument("--width", type=int, default=960, help="pixels; the height is 3/4 of it")
     parser.add_argument("--samples", type=int, default=16, help="of the light, per pixel")
     options = parser.parse_args()
@@ -189,7 +192,7 @@ def main() -> None:
     mesh, own = scene_mesh(160)
     traced, light = traced_mesh(mesh, 1e-3), Lighting(tables(read_map(MAP)))
     random = np.random.default_rng(9)
-    for view in range(options.photographs):
+    for view in range(options.first or options.photographs):
         rays = image_rays(cameras, view)
         hit = traced.visibility.closest_hit(rays.origin, rays.direction)
         there = hit.face >= 0
@@ -206,8 +209,13 @@ def main() -> None:
             point, normal, point.new_empty(len(point), 0), albedo, roughness, there.float(), hit.t
         )
         color = relight_surface(
-            surface, -rays.direction, traced, light, samples=max(1, options.samples // 4),
-            bounces=1, seed=view,
+            surface,
+            -rays.direction,
+            traced,
+            light,
+            samples=max(1, options.samples // 4),
+            bounces=1,
+            seed=view,
         )
         color[~there] = background(light.tables, rays.direction[~there])
         picture = color.reshape(height, 2, width, 2, 3).mean((1, 3)) * EXPOSURE
@@ -221,7 +229,7 @@ def main() -> None:
         if options.masks:
             mask = mine.reshape(height, 2, width, 2).float().mean((1, 3)).numpy()
             Image.fromarray((255 * mask + 0.5).astype(np.uint8)).save(options.masks / f"{name}.png")
-    print(f"{options.photographs} photographs of {width}x{height} in {options.out}")
+    print(f"{view + 1} photographs of {width}x{height} in {options.out}")
 
 
 if __name__ == "__main__":

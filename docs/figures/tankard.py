@@ -23,7 +23,6 @@ from univoxel.color import linear_to_srgb
 from univoxel.detail.texture import albedo_near
 from univoxel.envmap import EnvMap, lookup, read_map
 from univoxel.evaluation.measures import render_layers
-from univoxel.render.pictures import mirror_ball
 from univoxel.run import photos_of
 
 MAPS = Path(univoxel.__file__).parent / "example_data/tiny/envmaps"
@@ -34,7 +33,7 @@ BACK = (236, 236, 238)
 
 def upright(picture: Image.Image, side: int) -> Image.Image:
     """Over the background, turned, cut to the object and square."""
-    plate = Image.new("RGBA", picture.size, BACK + (255,))
+    plate = Image.new("RGBA", picture.size, (*BACK, 255))
     plate.alpha_composite(picture.convert("RGBA"))
     turned = plate.convert("RGB").transpose(Image.Transpose.ROTATE_270)
     return turned.resize((side, side), Image.Resampling.LANCZOS)
