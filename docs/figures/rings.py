@@ -52,7 +52,8 @@ def main(out: Path) -> None:
             at = math.radians(angle)
             px, py = x + 1.35 * RADIUS * math.cos(at), y - 1.35 * RADIUS * math.sin(at)
             parts.append(
-                f'<line x1="{px:.1f}" y1="{py:.1f}" x2="{x}" y2="{y}" stroke="{color}" opacity=".35"/>'
+                f'<line x1="{px:.1f}" y1="{py:.1f}" x2="{x}" y2="{y}" '
+                f'stroke="{color}" opacity=".35"/>'
             )
             parts.append(camera(px, py, angle + 180, color))
     for k, ((_, _, color), name) in enumerate(zip(RINGS, NAMES, strict=True)):
