@@ -29,7 +29,15 @@ COMMON = {"--help", "--quiet", "--verbose", "--threads", "--from"}
 WORDS = {
     *("ADDRESS", "ANGLE", "AZIMUTH", "DATA", "DEGREES", "ELEVATION", "FACTOR", "FILE", "HEIGHT"),
     *("INTENSITY", "IRRADIANCE", "NAME", "PIXELS", "SHARE", "TEXELS"),
-    *("COLMAP", "EPYC", "OPENCV", "OMP_NUM_THREADS", "ATEN_CPU_CAPABILITY", "QT_QPA_PLATFORM"),
+    *(
+        "COLMAP",
+        "EPYC",
+        "PSNR",
+        "OPENCV",
+        "OMP_NUM_THREADS",
+        "ATEN_CPU_CAPABILITY",
+        "QT_QPA_PLATFORM",
+    ),
 }
 
 
