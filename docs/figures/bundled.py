@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/guide and docs/explanation that show the bundled scene.
+"""Draws the pictures of the documentation that show the bundled scene.
 
     univoxel train univoxel/example_data/tiny --out RUN --preset fast --minutes 4 \\
         --set stages.0.voxels=0.27 --set stages.1.voxels=0.6 --set stages.3.voxels=0.6 \\
@@ -77,14 +77,6 @@ def from_color(linear: np.ndarray) -> Image.Image:
     return square(Image.fromarray((255 * encoded(linear)).round().astype(np.uint8)))
 
 
-def masks(out: Path) -> None:
-    """Some photographs, and their masks below."""
-    paths = [SCENE / f"train/r_{n:03d}.png" for n in (0, 7, 14, 21)]
-    photographs = beside([square(opened(p, "#8d9aa3")) for p in paths])
-    shapes = beside([square(Image.open(p).getchannel("A")) for p in paths])
-    below([photographs, shapes]).save(out / "masks.png", optimize=True)
-
-
 def stage_frames(run: Path, out: Path) -> None:
     """Render, albedo and normals as each stage ends."""
     stages = json.loads((run / "config.json").read_text())["stages"]
@@ -120,20 +112,6 @@ def doubt(test: Path, out: Path) -> None:
     beside([*pictures, from_values(error, 0.15)]).save(out / "doubt.png", optimize=True)
 
 
-def relit(run: Path, work: Path, out: Path) -> None:
-    """A test view as photographed, under two maps, and under a sun on a floor."""
-    size = "--resolution", str(SIDE)
-    maps = [str(SCENE / f"envmaps/{name}.hdr") for name in ("city", "sunset")]
-    univoxel("relight", str(run), "--envmap", *maps, *size, "--out", str(work / "maps"))
-    sun = ("--sun", "250", "45", "2.5", "4", "--envmap", maps[0], "--exposure", "0.8")
-    floor = ("--ground", "lowest", "--samples", "256")
-    univoxel("relight", str(run), *sun, *floor, *size, "--out", str(work / "sun"))
-    name = f"r_{VIEW:03d}.png"
-    pictures = [opened(SCENE / "test" / name), opened(work / "maps/city" / name)]
-    pictures += [opened(work / "maps/sunset" / name), opened(work / "sun" / name, "white")]
-    beside([square(p) for p in pictures]).save(out / "relit.png", optimize=True)
-
-
 def point_light(run: Path, work: Path, out: Path) -> None:
     """The view and its point; the local light there, the map with what blocks it, the truth."""
     path = work / "point.png"
@@ -150,30 +128,16 @@ def point_light(run: Path, work: Path, out: Path) -> None:
     beside([view, *right]).save(out / "point_light.png", optimize=True)
 
 
-def info(run: Path, work: Path, out: Path) -> None:
-    """Where nodes are stored, without the numbers below."""
-    path = work / "info.png"
-    univoxel("info", str(run), "--picture", str(path))
-    whole = Image.open(path).convert("RGB")
-    rows = np.asarray(whole)[:, 12]
-    colored = np.flatnonzero((rows.max(1).astype(int) - rows.min(1)) > 60)
-    bar = colored[np.flatnonzero(np.diff(colored) > 3)[0]] if len(colored) else whole.height
-    whole.crop((0, 0, whole.width, int(bar) + 10)).save(out / "info.png", optimize=True)
-
-
 def main() -> None:
     run, out = map(Path, sys.argv[1:])
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
-        masks(out)
         stage_frames(run, out)
         univoxel("envmap", str(run), "--out", str(work / "light.exr"))
         Image.open(work / "light.png").save(out / "envmap.png", optimize=True)
         univoxel("eval", str(run), "--save", str(work / "test"))
         doubt(work / "test", out)
-        relit(run, work, out)
         point_light(run, work, out)
-        info(run, work, out)
 
 
 if __name__ == "__main__":

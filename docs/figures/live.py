@@ -1,9 +1,9 @@
-"""Draws docs/images/live.png: the live viewer in a browser, after a click on the object.
+"""Draws docs/images/live.jpg: the live viewer in a browser, after a click on the object.
 
-    python docs/figures/live.py RUN "Half an avocado and a bell pepper" docs/images
+    python docs/figures/live.py RUN "A clay bird" docs/images
 
-RUN is that of bundled.py. It needs the extra `view` and a browser, which scripts/browser.sh brings
-in.
+RUN is that of the tutorial "Your first object". It needs the extra `view` and a browser, which
+scripts/browser.sh brings in.
 """
 
 from __future__ import annotations
@@ -26,8 +26,6 @@ WINDOW = (1160, 720)
 PLACE = (400, 330)  # of the click: where the one hides the sky from the other
 LEFT = (slice(0, 720), slice(0, 800))  # of the window, beside the controls
 SECONDS = 30.0  # until there is little noise
-SCALE = 0.75  # of what is written
-COLORS = 256
 # That WebGL is drawn in software says nothing of the viewer.
 CLOSE = 'document.querySelectorAll(".mantine-Notification-closeButton").forEach((b) => b.click())'
 
@@ -42,11 +40,7 @@ def main(run: Path, title: str, out: Path) -> None:
         tab.mouse("mousePressed", *PLACE, button="left", clickCount=1)
         tab.mouse("mouseReleased", *PLACE, button="left", clickCount=1)
         picture = Image.fromarray(seen(tab, SECONDS))
-    size = [round(SCALE * side) for side in picture.size]
-    small = picture.resize(size, Image.Resampling.LANCZOS)
-    palette = small.quantize(COLORS)
-    dithered = small.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG)
-    dithered.save(out / "live.png", optimize=True)
+    picture.save(out / "live.jpg", quality=88)
 
 
 def seen(tab, seconds: float) -> np.ndarray:

@@ -1,12 +1,8 @@
-"""Draws docs/images/real.jpg and docs/images/sneaker.png: a photograph, and its model.
+"""Draws docs/images/real.jpg: a photograph, and its model.
 
     univoxel poses ethiopian_head/images --masks ethiopian_head/masks --out HEAD
     univoxel train HEAD --out RUN --preset fast
     python docs/figures/model.py RUN docs/images/real.jpg forest_slope.hdr sunset.hdr
-
-    univoxel train sneaker --out RUN --preset fast
-    python docs/figures/model.py RUN docs/images/sneaker.png forest_slope.hdr studio.hdr \\
-        --layers albedo roughness normal
 
 From the left: a photograph that training did not see, on black; the render; the layers; the model
 under each map. The head is vork/ethiopianHead, photographs by Daniel Pett (British Museum),

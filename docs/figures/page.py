@@ -1,9 +1,10 @@
-"""Draws docs/images/page.png: the page of a run in a browser, on a desk and on a phone.
+"""Draws docs/images/page.jpg: the page of a run in a browser, on a desk and on a phone.
 
-    univoxel view RUN --html RUN/page.html --title "Half an avocado and a bell pepper"
+    univoxel view RUN --html RUN/page.html --title "A clay bird"
     python docs/figures/page.py RUN/page.html docs/images
 
-RUN is that of bundled.py. It needs a browser, which scripts/browser.sh brings in.
+RUN is that of the tutorial "Your first object". It needs a browser, which scripts/browser.sh brings
+in.
 """
 
 from __future__ import annotations
@@ -18,8 +19,6 @@ from browser import browser
 
 DESK, PHONE = (1160, 720), (360, 720)
 GAP = 12  # pixels between them
-SCALE = 0.75  # of what is written
-COLORS = 256
 
 
 def main(page: Path, out: Path) -> None:
@@ -34,11 +33,7 @@ def main(page: Path, out: Path) -> None:
     picture = Image.new("RGB", (DESK[0] + GAP + PHONE[0], DESK[1]), "white")
     picture.paste(shots[0], (0, 0))
     picture.paste(shots[1], (DESK[0] + GAP, 0))
-    size = [round(SCALE * side) for side in picture.size]
-    small = picture.resize(size, Image.Resampling.LANCZOS)
-    palette = small.quantize(COLORS)
-    dithered = small.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG)
-    dithered.save(out / "page.png", optimize=True)
+    picture.save(out / "page.jpg", quality=88)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Draws docs/images/report.png: the first section of a report, what to photograph next.
+"""Draws docs/images/report.jpg: the first section of a report, what to photograph next.
 
     python benchmarks/advice.py univoxel/example_data/tiny WORK
     univoxel report WORK/before
@@ -19,7 +19,6 @@ from browser import browser
 
 DESK = (1180, 1200)
 MARGIN = 8  # pixels around the section
-SCALE = 0.75  # of what is written
 
 
 def main(page: Path, out: Path) -> None:
@@ -31,9 +30,7 @@ def main(page: Path, out: Path) -> None:
         shot = Image.fromarray(tab.screenshot())
     edges = (x - MARGIN, y - MARGIN, x + width + MARGIN, y + height + MARGIN)
     picture = shot.crop(tuple(round(edge) for edge in edges))
-    size = [round(SCALE * side) for side in picture.size]
-    picture = picture.resize(size, Image.Resampling.LANCZOS).quantize(128)
-    picture.save(out / "report.png", optimize=True)
+    picture.save(out / "report.jpg", quality=88)
 
 
 if __name__ == "__main__":
