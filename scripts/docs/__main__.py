@@ -27,7 +27,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="check the documentation, or bring it up to date")
     parser.add_argument("--write", action="store_true", help="refill the generated blocks")
     parser.add_argument("--release", action="store_true", help="figures must be of one version")
+    parser.add_argument(
+        "--sample", type=int, metavar="N", help="print N sentences to judge, and end"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the sample")
     options = parser.parse_args()
+    if options.sample:
+        print(*doc_words.sample(ROOT, options.sample, options.seed), sep="\n")
+        return 0
     faults = doc_blocks.update(ROOT, write=options.write)
     faults += doc_blocks.unused(ROOT) + doc_prose.faults(ROOT)
     faults += doc_names.faults(ROOT) + doc_truth.faults(ROOT)

@@ -8,6 +8,7 @@ blocks are skipped, and so are words in italics, which are mentioned rather than
 from __future__ import annotations
 
 import ast
+import random
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -175,3 +176,36 @@ def texts(source: str) -> Iterator[tuple[int, str]]:
 
 def _told(match: re.Match[str], instead: str) -> str:
     return f"{match.group().strip()!r}: write {instead}"
+
+
+# Where a sample of sentences comes from, and its share
+SAMPLED = {
+    "README.md": 0.1,
+    "docs/tutorials/*.md": 0.1,
+    "docs/guide/*.md": 0.25,
+    "docs/method/*.md": 0.1,
+    "docs/results/*.md": 0.05,
+    "docs/reference/*.md": 0.15,
+    "univoxel/**/*.py": 0.25,
+}
+
+
+def sample(root: Path, count: int, seed: int) -> list[str]:
+    """Random sentences of pages and program, `count` in all, for a reader who judges them."""
+    draw, drawn = random.Random(seed), []
+    for pattern, share in SAMPLED.items():
+        found = []
+        for path in sorted(root.glob(pattern)):
+            text = path.read_text(encoding="utf-8")
+            if path.suffix == ".py":
+                told = [part for _, part in texts(text)]
+            else:
+                plain = doc_prose.without_blocks(doc_prose.without_code(text))
+                told = re.split(r"\n\s*\n|\n(?=\s*(?:[-|#>]|\d+\. ))", plain)
+            name = path.relative_to(root).as_posix()
+            for part in told:
+                for sentence in re.split(r"(?<=[.?!:]) +(?=[A-Z`*])", " ".join(part.split())):
+                    if len(sentence.split()) > 4 and not sentence.startswith("|"):
+                        found.append(f"{name}: {sentence}")
+        drawn += draw.sample(found, min(len(found), round(share * count)))
+    return drawn
