@@ -154,7 +154,7 @@ def test_metals_that_are_found_from_metal_everywhere_have_to_be_better(
         (None, 0.3, 1.05, False, True),
         (None, 0.3, 1.12, False, False),
         (None, 0.0, 0.85, False, False),  # a coloured sheen on wood
-        (None, 0.0, 0.5, False, True),  # dark bronze, which the stages before take for paint
+        (None, 0.0, 0.3, False, True),  # dark bronze, which the stages before take for paint
         (None, 0.3, 0.5, True, False),  # photographs that mirror a map each
         (False, 0.3, 0.5, False, False),
         (True, 0.0, 9.0, False, True),

@@ -167,10 +167,10 @@ TRIAL_ROUNDS = 4
 # Share of the residual so far that metals which were found again may leave to be taken
 BETTER = 0.9
 # Times the residual of metal as it was found that metal everywhere may leave for all to be metal:
-# where that is unlikely, and where it is likely. It leaves 0.25 of a bronze head that the stages
-# before take for paint, 0.85 of waxed wood; 1.07 at most of four of five objects all of metal, and
-# 1.12 and more where some is
-ONLY_METAL = (0.6, 1.09)
+# where that is unlikely, and where it is likely. It leaves 0.26 of a bronze head that the stages
+# before take for paint, 0.6 and more of wood and paint; 1.05 at most of six of seven objects that
+# are all metal, and 1.12 and more of others on which metal is likely
+ONLY_METAL = (0.4, 1.09)
 # Median of the brightest channel where all is metal: nothing else tells how bright the light is
 ONLY_METAL_ALBEDO = 0.3
 
