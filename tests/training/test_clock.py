@@ -267,7 +267,7 @@ def test_a_stage_that_is_shortened_runs_through_its_schedule(tmp_path, clock, ca
     assert done[-1] > 0.99
     assert (progress.clock.early, progress.state()["early"]) == ([0], [0])
     assert progress.clock.pace == 1.0
-    assert "time ended" not in caplog.text
+    assert "time limit ended" not in caplog.text
 
 
 def test_without_a_limit_every_step_is_made(tmp_path, clock):
