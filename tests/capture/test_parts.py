@@ -70,9 +70,9 @@ def test_one_lens_at_one_zoom_is_one_camera_held_either_way():
     assert groups == [[0, 1, 6], [2, 5], [3], [4]]
     said = in_words(photographs, groups)
     assert said == (
-        "7 photographs of 4 cameras (2 models, 2 zoom settings, 2 sizes), 1 of them portrait"
+        "7 photographs from 4 cameras (2 models, 2 zoom settings, 2 sizes), 1 of them portrait"
     )
-    assert in_words(photographs[:1], [[0]]) == "1 photographs of Phone (40x30)"
+    assert in_words(photographs[:1], [[0]]) == "1 photographs from Phone (40x30)"
 
 
 def _features(seed, count=40):
