@@ -79,7 +79,7 @@ def _option(parameter: inspect.Parameter, hint: Any) -> tuple[str, str]:
     kinds = list(_leaves(hint))
     choices = [str(c) for kind in kinds for c in typing.get_args(kind) if _is_literal(kind)]
     if any(m.positional for m in _metadata(hint)):
-        return f"`{metavar or parameter.name.upper()}`", ""
+        return f"`{metavar or parameter.name.upper()}`".replace("|", "\\|"), ""
     named = next((m.name for m in _metadata(hint) if m.name), parameter.name)
     flag = "--" + named.replace("_", "-")
     if kinds == [bool]:

@@ -235,7 +235,7 @@ def test_where_photographs_lie(tmp_path):
     (tmp_path / "x/images").rename(tmp_path / "x/DCIM")
     assert len(find_photographs(tmp_path / "x")[0]) == 1
     (tmp_path / "x/preview.jpg").unlink()
-    with pytest.raises(DataError, match="got none but in DCIM: give that folder, or put all into"):
+    with pytest.raises(DataError, match="got none, but some in DCIM: pass that folder, or put all"):
         find_photographs(tmp_path / "x")
 
 
@@ -250,9 +250,9 @@ def test_heic_under_another_name(tmp_path):
 def test_a_missing_reader_is_named_before_reading(tmp_path, monkeypatch):
     monkeypatch.setattr(module.importlib.util, "find_spec", lambda name: None)
     require_readers([tmp_path / "a.jpg"])
-    with pytest.raises(MissingExtra, match=r"a.HEIC: HEIC needs pillow-heif: pip install"):
+    with pytest.raises(MissingExtra, match=r"a.HEIC: reading HEIC needs pillow-heif: pip install"):
         require_readers([tmp_path / "a.HEIC"])
-    with pytest.raises(MissingExtra, match=r"a.nef: RAW needs rawpy"):
+    with pytest.raises(MissingExtra, match=r"a.nef: reading RAW needs rawpy"):
         require_readers([tmp_path / "a.nef"])
 
 

@@ -164,4 +164,4 @@ def test_few_points_that_leave_the_place_open_stay_weak():
 def test_many_points_do_not_help_where_matches_contradict_the_place():
     against = {**NEAR, 4: [Partner(n, 500, 200) for n in (1, 2, 3)]}
     found = weak({1: 900, 2: 900, 3: 900, 4: 900}, against, dict.fromkeys(range(1, 5), 0.1))
-    assert found == {4: "60% of its matches contradict its place"}
+    assert found == {4: "60% of its matches contradict its pose"}

@@ -151,9 +151,9 @@ def test_the_world_is_upright_around_the_object(scene):
 
 def test_what_is_left_out_is_named(scene):
     out, said = scene
-    assert f"{VIEWS + 1} photographs of 2 cameras (2 zoom settings)" in said[0]
+    assert f"{VIEWS + 1} photographs from 2 cameras (2 zoom settings)" in said[0]
     assert "2 could not be read: broken.jpg, notes.txt" in said[0]
-    assert any(f"{VIEWS} of {VIEWS + 1} placed" in line for line in said)
+    assert any(f"{VIEWS} of {VIEWS + 1} registered" in line for line in said)
     assert any("white.jpg (no features in it that can be matched)" in line for line in said)
     report = json.loads((out / "poses.json").read_text())
     rows = {row["name"]: row for row in report["photographs"]}
@@ -329,7 +329,7 @@ def test_too_few_placed_is_one_line(photographs, tmp_path):
         shutil.copy(photographs / f"IMG {v:02d}.jpg", folder)
     for k in range(4):
         Image.new("RGB", (WIDTH, HEIGHT), (60 * k, 0, 0)).save(folder / f"plain{k}.png")
-    with pytest.raises(DataError, match=r"only \d of 6 photographs were registered .*plain0.png"):
+    with pytest.raises(DataError, match=r"only \d of 6 photographs were registered.*plain0.png"):
         poses(folder, tmp_path / "out", config=SMALL)
     assert not (tmp_path / "out/images").exists()
 
@@ -363,11 +363,11 @@ def pycolmap_that(does: str, folder: Path) -> str:
 def test_a_step_that_fails_or_hangs_is_stopped(tmp_path, monkeypatch):
     request = sfm.Request("match", str(tmp_path / "none.db"), "", "", seconds=0.1)
     log = tmp_path / "match.log"
-    with pytest.raises(ProcessFailed, match=r"match: pycolmap ended with .*match.log"):
+    with pytest.raises(ProcessFailed, match=r"match: pycolmap failed .*match.log"):
         list(sfm.run(sfm.Request("match", "/", "/", "/"), log, lambda: 0))
     path = pycolmap_that("import time; time.sleep(60)", tmp_path)
     monkeypatch.setenv("PYTHONPATH", path)
-    with pytest.raises(ProcessFailed, match="was stopped after 0 seconds"):
+    with pytest.raises(ProcessFailed, match="was stopped after 0 s"):
         list(sfm.run(request, log, lambda: 0))
 
 

@@ -139,7 +139,7 @@ def test_masks_that_are_mostly_wrong_stay(tmp_path, with_masks, caplog):
     said = [r for r in caplog.records if r.levelno == logging.WARNING]
     assert len(said) == 1
     assert "none is corrected" in said[0].getMessage()
-    assert "look at masks.html" in said[0].getMessage()
+    assert "check masks.html" in said[0].getMessage()
     cut = load_photos(out)
     for view, mask in enumerate(masks):
         assert torch.equal(cut.picture(view)[1], mask)
@@ -155,7 +155,7 @@ def test_few_masks_stay_as_they_are(tmp_path, caplog):
     assert "that needs 12 photographs, there are 4" in caplog.text
     masks[1][:] = 0
     write_masks(folder, masks, photos.names)
-    with pytest.raises(DataError, match="the mask of r_1 shows nothing"):
+    with pytest.raises(DataError, match="the mask of r_1 is empty"):
         task.cutout(data, tmp_path / "other", folder)
     with pytest.raises(DataError, match="the mask of r_0 shows nothing in the box"):
         task.cutout(data, tmp_path / "other", folder, box=(0, 0, 9, 1, 1, 10))

@@ -216,7 +216,7 @@ def test_bad_maps_and_cameras_name_the_file(run):
     for content, message in (
         ("{}", "expected a list of frames"),
         ('{"frames": [{"transform_matrix": 1}]}', "transform_matrix"),
-        ('{"frames": [{"file_path": "a"}, {"file_path": "a"}]}', "a name of its own"),
+        ('{"frames": [{"file_path": "a"}, {"file_path": "a"}]}', "unique names"),
     ):
         (run / "bad.json").write_text(content)
         with pytest.raises(DataError, match=rf"bad\.json.*{message}"):

@@ -106,7 +106,7 @@ def test_broken_relit_views(tmp_path):
         load_relit(photos(tmp_path), "city")
     write_png(tmp_path / "relight" / "city" / "r_0.png", rgba())
     write_png(tmp_path / "relight" / "city" / "r_1.png", rgba(width=5))
-    with pytest.raises(DataError, match=r"city/r_1\.png: expected 6x4 pixels like .*, got 5x4"):
+    with pytest.raises(DataError, match=r"city/r_1\.png: expected 6x4 pixels as .*, got 5x4"):
         load_relit(photos(tmp_path, "r_0", "r_1"), "city")
 
 

@@ -288,7 +288,7 @@ REFUSED = {
           for x in (-1, 180, 2**40, -(2**63))),
         ({"amount": 2.0}, r"amount must be in \[0, 1\], got 2.0"),
         ({"order": 3}, "order must be 1 or 2, got 3"),
-        ({"grid": torch.zeros(3, 3, 3, 4)[..., ::2]}, "grid must be contiguous"),
+        ({"grid": torch.zeros(3, 3, 3, 4)[..., ::2]}, "it must be contiguous"),
     ],
     "smooth_rows_ of bricks": [
         *(({"rows": torch.tensor([x])}, "rows must be of bricks that stand somewhere")
@@ -303,7 +303,7 @@ REFUSED = {
         ({"amount": 1.5}, "amount must be in"),
         ({"passes": -1}, "passes must be at least 0"),
         ({"size": (2, 2)}, "size must be that of the grid"),
-        ({"values": torch.ones(354)[::2]}, "values must be contiguous"),
+        ({"values": torch.ones(354)[::2]}, "they must be contiguous"),
     ],
     "adam_rows_": [
         ({"param": torch.zeros(4, 12).T}, "param must be contiguous, got strides"),

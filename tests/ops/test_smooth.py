@@ -128,7 +128,7 @@ def test_diffusion_of_nothing_and_of_no_pass_changes_nothing():
 def test_diffusion_refuses_what_does_not_fit_its_memory_or_its_bricks():
     one, rows = torch.ones(1), torch.tensor([128])
     _, _, bricks = cut(torch.linspace(-1, 1, 512).view(8, 8, 8), far=1.0)
-    with pytest.raises(ValueError, match="values must be contiguous"):
+    with pytest.raises(ValueError, match="they must be contiguous"):
         diffuse_rows_(torch.ones(4)[::2], torch.tensor([0, 1]), (2, 2, 2), 0.5, 1)
     with pytest.raises(ValueError, match="size must be that of the grid"):
         diffuse_rows_(one, rows, (8, 8, 9), 0.5, 1, bricks)

@@ -180,7 +180,7 @@ def test_a_recovered_map_is_shown_as_it_is():
     scene = scene_of((0.5, 0.5, 0.5), 0.5, 32)
     found = report_pictures.found_light(scene, extract_mesh(scene))
     torch.testing.assert_close(found.radiance, scene.environment().latlong(report_pictures.ROWS))
-    assert "was recovered" in found.about
+    assert "recovered environment map" in found.about
 
 
 def test_baked_light_is_none():

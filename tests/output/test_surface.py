@@ -48,7 +48,7 @@ def test_crumbs_go_and_a_small_part_stays(caplog):
     assert len(parts) == 2
     areas = sorted(part.area for part in parts)
     assert areas[0] / areas[1] == pytest.approx(0.03, rel=0.1)
-    assert "pieces beside the object that were left out: 1; hollows inside it: 1" in caplog.text
+    assert "1 small pieces beside the object and 1 hollows inside it" in caplog.text
 
 
 @pytest.mark.parametrize("cut", [False, True])

@@ -77,9 +77,9 @@ def test_one_bad_step_is_dropped(data, tmp_path, monkeypatch, caplog, how):
     assert finite(load_scene(out))
     (told,) = events(out)
     what = "the loss is nan" if how is bad_loss else "a gradient is not finite"
-    assert told.startswith(f"stage 1, step 7: {what}; dropped this step, steps are 0.5 times")
+    assert told.startswith(f"stage 1, step 7: {what}; dropped this step, step size now times 0.5")
     assert told in caplog.messages
-    assert "training met trouble once and went on" in caplog.text
+    assert "training had to recover once" in caplog.text
 
 
 def test_a_failure_that_stays_ends_its_stage(data, tmp_path, monkeypatch):

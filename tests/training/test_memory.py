@@ -41,7 +41,7 @@ def test_a_machine_that_has_enough_is_told_nothing(photos, fast, caplog):
 def test_little_that_is_free_is_a_warning(photos, fast, caplog):
     with caplog.at_level(logging.WARNING, "univoxel"):
         check_memory(photos, fast, Memory(32 * GB, 4 * GB))
-    assert "100 photographs of 2000x2000 pixels needs about 11.1 GB, of 32.0 GB 4.0 are free" in (
+    assert "100 photographs of 2000x2000 pixels needs about 11.1 GB; 4.0 of 32.0 GB are free" in (
         caplog.text
     )
     assert "pass downscale=2 or close other programs" in caplog.text

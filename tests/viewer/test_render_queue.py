@@ -241,7 +241,7 @@ def test_interrupting_ends_it(tmp_path):
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
         )
     end = time.monotonic() + PATIENCE
-    while "in a browser: http://localhost" not in log.read_text():
+    while "Open http://localhost" not in log.read_text():
         assert process.poll() is None
         assert time.monotonic() < end
         time.sleep(0.1)

@@ -167,20 +167,18 @@ def test_the_port_is_taken_which_is_said_before_anything(tmp_path, capfd):
         other.listen()
         port = other.getsockname()[1]
         missing = tmp_path / "photographs"
-        with pytest.raises(UserError, match=f"^127.0.0.1:{port} is taken"):
+        with pytest.raises(UserError, match=f"^127.0.0.1:{port} is in use"):
             train(three_stages(missing, tmp_path / "run"), view=("127.0.0.1", port))
         arguments = ["train", str(missing), "--out", str(tmp_path / "run")]
         assert main([*arguments, "--view", "--port", str(port)]) == 2
         said = capfd.readouterr().err
-        assert said.startswith(f"univoxel train: 127.0.0.1:{port} is taken")
+        assert said.startswith(f"univoxel train: 127.0.0.1:{port} is in use")
         assert said.count("\n") == 1
         assert not (tmp_path / "run").exists()
         for option in (["--port", str(port)], ["--host", "0.0.0.0"]):
             assert main([*arguments, *option]) == 2
             said = capfd.readouterr().err
-            assert (
-                said == f"univoxel train: expected --view with {' '.join(option)}, got that alone\n"
-            )
+            assert said == f"univoxel train: {' '.join(option)} needs --view\n"
 
 
 def test_by_the_command_line(data, tmp_path, capfd, monkeypatch):
