@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
+import textured_room
 from tiny import CHANGES
 
 ROOT = Path(__file__).parent.parent
@@ -24,12 +25,15 @@ OTHERS = (
 )  # programs that are not ours
 ELSEWHERE = ("--scheduler", "photos/*")  # of a cluster, and of photographs that the reader has
 
+PHONE = "python examples/phone_photographs.py"
+VIEWS = 11  # of 36 around the object
+
 # What makes a command small, by its beginning
 TINY = [f"--set={change}" for change in (*CHANGES, "carving_seconds=0")]
 SMALL = {
-    "python examples/phone_photographs.py": ["--first", "11", "--width", "400", "--samples", "4"],
+    PHONE: ["--first", "1", "--width", "64", "--samples", "4"],
     "univoxel capture": ["--preset", "draft", *TINY],
-    "univoxel batch": ["--samples", "2", *TINY],
+    "univoxel batch": ["--steps", "train", "export", "--samples", "2", *TINY],
     "univoxel eval": ["--samples", "2"],
     "univoxel relight": ["--orbit", "2", "--resolution", "48", "--samples", "2"],
     "univoxel export": ["--texture-size", "64", "--faces", "500"],
@@ -77,7 +81,20 @@ def run(page: str, failing: tuple[int, ...] = ()) -> list[str]:
         wanted = 2 if number in failing else 0
         assert ended.returncode == wanted, f"{command}\n{ended.stdout}{ended.stderr}"
         printed.append(ended.stdout + ended.stderr)
+        if command.startswith(PHONE):
+            replace_photographs(Path("bird_photos"), Path("bird_masks"))
     return printed
+
+
+def replace_photographs(photographs: Path, masks: Path) -> None:
+    """Put others in their place, small ones, whose cameras are found in seconds."""
+    for folder in (photographs, masks):
+        for file in folder.iterdir():
+            file.unlink()
+    for v, view in enumerate(textured_room.orbit(36, 400, 300)[:VIEWS]):
+        picture, mask = textured_room.photograph(view)
+        picture.save(photographs / f"IMG_{v:02d}.jpg", quality=92)
+        mask.save(masks / f"IMG_{v:02d}.png")
 
 
 def code(page: str) -> str:
