@@ -49,7 +49,7 @@ def test_fine_stages_may_be_sparse():
     dense = with_field(preset("fast", Path("photos"), Path("run")), "dense")
     assert with_field(config, "dense") == replace(dense, capacity="fixed")
     assert dense.capacity == "adaptive"
-    with pytest.raises(ValueError, match="no dense stage can follow a sparse one, got sparse, d"):
+    with pytest.raises(ValueError, match="a dense stage cannot follow a sparse one, got sparse, d"):
         replace(CONFIG, stages=(replace(STAGE, field="sparse"), STAGE))
 
 
@@ -58,7 +58,9 @@ def test_all_stages_are_hashed_or_none():
     assert with_field(config, "hash") == config
     assert {s.field for s in config.stages if isinstance(s, StageConfig)} == {"hash"}
     assert config.capacity == "adaptive"
-    with pytest.raises(ValueError, match="hash is for all stages or none, got dense, hash"):
+    with pytest.raises(
+        ValueError, match="either all stages use hash or none does, got dense, hash"
+    ):
         replace(CONFIG, stages=(STAGE, replace(STAGE, field="hash")))
     with pytest.raises(ValueError, match=r"scene.channels must be a multiple of that, got 7"):
         replace(config, scene=SceneConfig(channels=7, material_channels=3))
@@ -73,7 +75,7 @@ def test_it_may_be_known_whether_all_is_metal():
     assert isinstance(some, JointConfig)
     assert some.only_metal is False
     lobes = preset("draft", Path("data"), Path("out"), "sg")
-    with pytest.raises(UserError, match=r"metal=all is for light=hybrid, .* got sg") as refused:
+    with pytest.raises(UserError, match=r"metal=all needs light=hybrid, .* got sg") as refused:
         with_metal(lobes, "all")
     assert refused.value.arguments == ("metal", "light")
 
@@ -259,7 +261,7 @@ def test_a_file_that_lacks_fields_has_the_defaults_of_version_0_2(tmp_path):
     assert found.stages == (plain_stage(1.0, 9, 1.0),)
     assert found == plain_training(Path("a"), tmp_path, found.stages, scene=found.scene)
     check_same(replace(found, downscale=1, voxel_pixels=0.0))
-    with pytest.raises(UserError, match="began with other scene"):
+    with pytest.raises(UserError, match="was started with another scene"):
         check_same(replace(found, scene=SceneConfig(light=EnvmapConfig())))
 
 

@@ -39,7 +39,7 @@ def test_the_model_draws(run):
     opened = univoxel.open_run(run)
     assert len(opened.mesh().vertices) > 100
     assert opened.verdict is None  # there was none
-    assert opened.trust.startswith("Uncertainty of the albedo")
+    assert opened.trust.startswith("Doubt of albedo")
     view = {"samples": 4, "cameras": "orbit 1", "resolution": 16}
     picture = univoxel.relight(run, CITY, **view)[0]
     assert picture.shape == (16, 16, 4)

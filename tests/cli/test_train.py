@@ -227,7 +227,7 @@ def test_another_field_is_as_good(data, run, tmp_path, kind):
     pixels = torch.cartesian_prod(torch.arange(2), torch.arange(32), torch.arange(32))
     psnr, of_dense = (loop.held_out_psnr(s, photos, pixels, physical=True) for s in (scene, dense))
     assert psnr > of_dense - 1.0  # two runs of 140 steps with other random numbers
-    with pytest.raises(ValueError, match="began with other stages"):
+    with pytest.raises(ValueError, match="was started with another stages"):
         train(config(data, out), resume=True)
 
 
