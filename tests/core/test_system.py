@@ -1,5 +1,6 @@
 """What other systems do in another way, with stand-ins for what they alone have."""
 
+import ctypes
 import os
 import re
 import signal
@@ -175,6 +176,21 @@ def test_peak_memory_is_in_the_unit_of_the_system(monkeypatch):
     process = types.SimpleNamespace(memory_info=lambda: info)
     monkeypatch.setattr(psutil, "Process", lambda: process)
     assert system.peak_memory_mb() == 3
+
+
+def test_freed_memory_is_returned(monkeypatch):
+    """Many pieces that glibc would keep, with one above them that holds the heap up."""
+    process = psutil.Process()
+    pieces = [bytearray(2000) for _ in range(50_000)]
+    last = bytearray(2000)
+    before = process.memory_info().rss
+    del pieces
+    system.release_memory()
+    if sys.platform == system.LINUX and hasattr(ctypes.CDLL(None), "malloc_trim"):
+        assert process.memory_info().rss < before - 50e6
+    monkeypatch.setattr(system.ctypes, "CDLL", lambda _: object())
+    system.release_memory()  # a library without the call
+    assert len(last) == 2000
 
 
 def test_what_a_system_lacks_is_none(monkeypatch):

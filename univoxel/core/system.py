@@ -183,6 +183,12 @@ def memory() -> tuple[int, int] | None:
     return found.total, found.available
 
 
+def release_memory() -> None:
+    """Return freed memory to the system. glibc keeps it for the process; others need no call."""
+    if sys.platform == LINUX:
+        getattr(ctypes.CDLL(None), "malloc_trim", lambda _: 0)(0)  # musl has none
+
+
 def peak_memory_mb() -> float | None:
     """Most memory that this process has had, MiB."""
     if sys.platform == WINDOWS:
