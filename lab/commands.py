@@ -1,4 +1,4 @@
-"""Commands for experiments: `univoxel lab compare`, `chart`, `stress`, `bank`, `submit`."""
+"""Commands for experiments, called `univoxel lab compare`, `chart` and so on."""
 
 from __future__ import annotations
 
@@ -197,10 +197,38 @@ def bank(
     print(suite.bank(out, render, judge, half, scenes, seed, label, **work))
 
 
+def published(
+    folder: Annotated[Path, written("DIR", positional=True)],
+    /,
+    out: Annotated[Path, written("DIR")],
+    preset: PresetName = "fast",
+    set: Changes = (),
+    jobs: AtOnce = 1,
+) -> None:
+    """Train on public data sets that you have, and print their tables.
+
+    Finds scenes of Synthetic4Relight, TensoIR-Synthetic, Shiny Blender and Stanford-ORB, trains on
+    each, and prints a table per data set with the metrics of its papers and what differs from
+    their protocol. Writes published.md and published.json too. The same command resumes after an
+    interruption. Nobody has run it on the real data sets yet.
+
+    Args:
+        folder: folder that holds the data sets, or one scene
+        out: folder for trainings and tables
+        preset: how much work goes into each training
+        set: configuration field of all trainings, as in train --set
+        jobs: trainings at the same time
+    """
+    from lab import published as experiment
+
+    print(experiment.published(folder, out, preset, set, jobs).read_text("utf-8"))
+
+
 COMMANDS: dict[str, Command] = {
     "compare": compare,
     "chart": chart,
     "stress": stress,
     "bank": bank,
     "submit": submit,
+    "published": published,
 }

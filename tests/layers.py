@@ -29,7 +29,7 @@ LAB_LAYERS = [
     {"worker"},
     {"runner"},
     {"chart", "compare", "stress", "submit"},
-    {"bank"},
+    {"bank", "published"},
     {"commands"},
 ]
 

@@ -92,7 +92,7 @@ COMMANDS: dict[str, Command] = {
 }
 
 # Written `univoxel lab NAME`; without the word, as they once were, they work too
-LABORATORY = ("compare", "chart", "stress", "bank", "submit")
+LABORATORY = ("compare", "chart", "stress", "bank", "submit", "published")
 
 
 def has_laboratory() -> bool:
