@@ -129,7 +129,7 @@ def test_capture_until_a_step(calls, capsys):
     assert capsys.readouterr().out == "mug/cut\n"
     assert calls.noted[0][2] == {"masks": "auto", "until": "masks", **USUAL}
     assert main(["capture", "photos", "--out", "mug", "--until", "cameras", "--minutes", "2"]) == 2
-    assert "--until cameras: --preset, --light, --minutes, --set come after it" in (
+    assert "--until cameras: --preset, --light, --minutes and --set have no effect" in (
         capsys.readouterr().err
     )
 

@@ -113,11 +113,11 @@ def test_gaps_are_told_by_side_and_by_the_photographs_beside():
     directions = _directions([0, 50, 150, 200, 250, 305])
     # Who stands where the first photograph was taken and looks at the object has +X at the right
     assert sphere.gaps(directions, names, 60.0) == [
-        "no photograph from the right, 100 degrees between 50.jpg and 150.jpg"
+        "no photograph from the right: there is a gap of 100 degrees between 50.jpg and 150.jpg"
     ]
     names = [f"{a}.jpg" for a in (0, 50, 100, 150, 200)]
     assert sphere.gaps(_directions([0, 50, 100, 150, 200]), names, 60.0) == [
-        "no photograph from the left, 160 degrees between 200.jpg and 0.jpg"
+        "no photograph from the left: there is a gap of 160 degrees between 200.jpg and 0.jpg"
     ]
     all_around = list(range(0, 360, 30))
     assert sphere.gaps(_directions(all_around), [""] * 12, 60.0) == []
@@ -126,5 +126,5 @@ def test_gaps_are_told_by_side_and_by_the_photographs_beside():
     ]
     turned = [(a + 70) % 360 for a in (0, 50, 100, 150, 200)]
     assert sphere.gaps(_directions(turned), names, 60.0, front=-20.0)[0].startswith(
-        "no photograph from the left, 160 degrees"
+        "no photograph from the left: there is a gap of 160 degrees"
     )

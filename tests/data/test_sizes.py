@@ -134,7 +134,7 @@ def test_messages_say_that_pixels_are_not_turned(turned):
     note = "; the EXIF orientation 6 of p_001"
     cameras = turned / "sparse/0/cameras.txt"
     cameras.write_text(cameras.read_text().replace(f"{WIDTH} {HEIGHT}", f"{HEIGHT} {WIDTH}"))
-    with pytest.raises(DataError, match=r"expected 8x12 pixels .*, got 12x8; the EXIF .* 6"):
+    with pytest.raises(DataError, match=r"expected 8x12 pixels.*, got 12x8; the EXIF .* 6"):
         load_photos(turned)
     frames = [{"file_path": "images/p_001.jpg", "transform_matrix": np.eye(4).tolist()}]
     root = {"fl_x": FOCAL, "w": HEIGHT, "h": WIDTH, "frames": frames}

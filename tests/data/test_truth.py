@@ -102,7 +102,7 @@ def test_broken_relit_views(tmp_path):
     (tmp_path / "relight" / "city").mkdir(parents=True)
     with pytest.raises(DataError, match=r"city: expected its environment map .*city\.hdr, but"):
         relight_maps(tmp_path)
-    with pytest.raises(DataError, match=r"relight/city: no picture .*r_0"):
+    with pytest.raises(DataError, match=r"relight/city: the image .*r_0 does not exist"):
         load_relit(photos(tmp_path), "city")
     write_png(tmp_path / "relight" / "city" / "r_0.png", rgba())
     write_png(tmp_path / "relight" / "city" / "r_1.png", rgba(width=5))

@@ -43,8 +43,8 @@ def test_a_missing_extension_is_told_once(monkeypatch, caplog):
     call()
     call()
     assert warned(caplog) == [
-        "univoxel.ops runs in eager torch, many times slower: the compiled extension is not "
-        "loaded: no extension built"
+        "univoxel.ops uses eager PyTorch, which is many times slower: the compiled extension is "
+        "not loaded: no extension built"
     ]
 
 
@@ -52,8 +52,8 @@ def test_a_type_without_kernels_is_told_once(caplog):
     for _ in range(2):
         call(torch.bfloat16)
     assert warned(caplog) == [
-        "univoxel.ops runs in eager torch, many times slower: kernels take float32 and float64 on "
-        "the cpu, got torch.bfloat16 on cpu"
+        "univoxel.ops uses eager PyTorch, which is many times slower: kernels support float32 and "
+        "float64 on the cpu, got torch.bfloat16 on cpu"
     ]
 
 

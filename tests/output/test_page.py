@@ -307,14 +307,16 @@ def test_training_ends_well_without_a_page(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr("univoxel.output.page.write_page", fail)
     with caplog.at_level(logging.INFO, "univoxel"):
         assert with_page(tmp_path) == tmp_path
-    assert caplog.messages == ["no page was written: there is no surface"]
+    assert caplog.messages == ["the web page was not written: there is no surface"]
 
 
 def test_training_names_its_page(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr("univoxel.output.page.write_page", lambda run, path: path)
     with caplog.at_level(logging.INFO, "univoxel"):
         with_page(tmp_path)
-    assert caplog.messages == [f"Page: open {tmp_path / 'index.html'}"]
+    page, then = caplog.messages
+    assert page == f"Page: open {tmp_path / 'index.html'} in a browser"
+    assert then.startswith(f"Next: univoxel view {tmp_path}, or univoxel export {tmp_path} ")
 
 
 def test_a_notebook_shows_the_page(scene, tmp_path, monkeypatch):

@@ -215,7 +215,7 @@ def test_what_time_cut_is_told(tmp_path):
     told = report.remarks(cfg, state)
     assert told[0] == "Training has not ended: it is in stage 4."
     assert "of the planned steps it made 40% for shape" in told[1]
-    assert "trouble 1 times, the last in a." in told[2]
+    assert "recovered 1 times, last in a." in told[2]
     assert report.stage_ends({}) == []
     assert report.prepared({}) is None
 
@@ -267,7 +267,7 @@ def test_a_run_whose_photographs_are_gone_shows_what_is_left(run, data, tmp_path
         report_text(moved, scene, state, ReportOptions(data=tmp_path / "gone"))
     (moved / "config.json").write_text("{")
     text = report_text(moved, scene, state, ReportOptions(size=SIZE))
-    assert "stages are missing" in text
+    assert "config.json could not be read" in text
 
 
 def test_metal_is_a_layer_where_there_is_any(tmp_path):
@@ -310,7 +310,7 @@ def test_by_the_command_line(run, capfd, tmp_path):
     assert "<h1>One</h1>" in text
     assert len(pictures(section(text, "Photographs and render"))) == 3
     for arguments, message in (
-        ([str(tmp_path)], f"not a trained run {tmp_path}"),
+        ([str(tmp_path)], f"{tmp_path}: not a trained run"),
         ([str(run.path), "--views", "-1"], "--views must be at least 0, got -1"),
         ([str(run.path), "--html", "a.pdf"], "--html: expected a file that ends in .html, got"),
         ([str(run.path), "--data", str(tmp_path / "none")], "none"),

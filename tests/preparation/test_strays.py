@@ -63,7 +63,7 @@ def test_cameras_off_the_circle_are_named(photos, caplog):
     say_strays(astray(photos))
     assert "3 of 16 photographs were placed off the circle of their turntable" in caplog.text
     assert "by up to 1.8 degrees, the others by a median of 0.0" in caplog.text
-    assert "what p_13, p_14, p_15 show will not fit" in caplog.text
+    assert "Surfaces that only p_13, p_14, p_15 show will not fit" in caplog.text
 
 
 def test_cameras_on_the_circle_are_right(photos, caplog):

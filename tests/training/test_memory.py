@@ -48,7 +48,7 @@ def test_little_that_is_free_is_a_warning(photos, fast, caplog):
 
 
 def test_more_than_there_is_in_all_is_refused(photos, fast):
-    with pytest.raises(UserError, match=r"of 8\.0 GB 6\.0 are free: pass downscale=2"):
+    with pytest.raises(UserError, match=r"6\.0 of 8\.0 GB are free: pass downscale=2"):
         check_memory(photos, fast, Memory(8 * GB, 6 * GB))
 
 

@@ -164,7 +164,7 @@ def test_shares_are_of_those_that_were_asked():
     [
         (["--render", "--judge"], "expected --render or --judge, got both"),
         (["--scenes", "0"], "--scenes must be at least 1 and --seed at least 0, got 0 and 0"),
-        (["--judge", "--label", "x"], "seed-0/runs: expected trainings named x, got none"),
+        (["--judge", "--label", "x"], "seed-0/runs: expected trainings named x, found none"),
     ],
 )
 def test_mistakes_are_one_line(tmp_path, capsys, options, message):

@@ -134,7 +134,7 @@ def test_photographs_of_another_kind_are_not_taken(stood_in, tmp_path, monkeypat
     )
     changed = dataclasses.replace(AXES["views"], levels=(*AXES["views"].levels[:-1], other))
     monkeypatch.setitem(AXES, "views", changed)
-    with pytest.raises(ValueError, match=r"views-6/damage\.json: is of other photographs"):
+    with pytest.raises(ValueError, match=r"views-6/damage\.json: made from other photographs"):
         suite.stress(tmp_path, ["views"], quick=True)
 
 
@@ -187,7 +187,7 @@ def test_without_mitsuba_one_line_names_the_extra(tmp_path, capsys, monkeypatch)
 
 def test_a_scene_of_another_kind_is_not_taken(tmp_path):
     (tmp_path / "scene.json").write_text("{}")
-    with pytest.raises(ValueError, match=r"scene\.json: is of another scene: remove"):
+    with pytest.raises(ValueError, match=r"scene\.json: made for another scene: remove"):
         render.render(Spec(), tmp_path)
 
 
