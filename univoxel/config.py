@@ -48,7 +48,7 @@ class StageConfig:
     """A stage of training at one grid resolution. Pairs are values at the start and the end."""
 
     voxels: float = field(
-        metadata=about("most in the object's box; see voxel_pixels", unit="millions", above=0)
+        metadata=about("at most, in the object's box; see voxel_pixels", unit="millions", above=0)
     )
     iterations: int = field(metadata=about("optimisation steps; fewer if time runs out", least=1))
     share: float = field(
@@ -122,7 +122,7 @@ class JointConfig:
 
     iterations: int = setting(675, "Adam steps in all rounds; fewer if time runs out", least=1)
     share: float = setting(0.27, "share of the time limit", above=0, most=1)
-    rays: int = setting(2048, "observations per step; at least views")
+    rays: int = setting(2048, "observations per step, no fewer than views")
     views: int = setting(4, "observations of a point per step", least=1)
     rounds: int = setting(4, "rounds of Newton steps on the map and Adam steps", least=1)
     points: int = setting(20400, "number of surface points", least=1)
@@ -183,7 +183,7 @@ class TrainConfig:
     )
     light_frame: LightFrameOrAuto = setting(
         "auto",
-        "world: the light stood still; turntable: it moved with the camera, see scene.turntable; "
+        "world: the light is fixed; turntable: it moves with the camera, see scene.turntable; "
         "camera: a flash, see scene.flash; auto: the best explanation of colour changes",
     )
     detail: Detailing = setting(
@@ -191,7 +191,7 @@ class TrainConfig:
     )
     carving_seconds: float = setting(
         12.0,
-        "most expected time on two cores for carving concavities; skipped if the light varies",
+        "maximum expected time for carving concavities on two cores; skipped if the light varies",
         unit="seconds",
         least=0,
     )
@@ -221,7 +221,7 @@ class TrainConfig:
             )
         if kinds != sorted(kinds):
             raise ConfigError(
-                f"TrainConfig: a dense stage cannot follow a sparse one, got {', '.join(kinds)}"
+                f"TrainConfig: dense stages must come before sparse ones, got {', '.join(kinds)}"
             )
         if "hash" in kinds and self.scene.channels % PER_LEVEL:
             raise ConfigError(
@@ -236,7 +236,7 @@ class TrainConfig:
             )
         if not self.scene.sky_nodes and any(isinstance(s, JointConfig) for s in self.stages):
             raise ConfigError(
-                "TrainConfig: a JointConfig stage needs scene.sky_nodes above 0, got 0"
+                "TrainConfig: a JointConfig stage needs scene.sky_nodes above 0, but it is 0"
             )
         if self.budget_mb is not None and self.capacity == "fixed":
             raise ConfigError(
@@ -276,7 +276,7 @@ def load_config(path: Path) -> TrainConfig:
     values = read_json(path)
     try:
         if not isinstance(values, dict):
-            raise ConfigError(f"expected an object with the configuration, got {values!r:.60}")
+            raise ConfigError(f"expected a JSON object of settings, got {values!r:.60}")
         values = {name: value for name, value in values.items() if name != "version"}
         if isinstance(values.get("scene"), dict):
             values["scene"] = dict(values["scene"])
@@ -298,7 +298,7 @@ def check_same(cfg: TrainConfig) -> None:
     except (OSError, UserError) as error:
         raise UserError(f"{path}: this run cannot be resumed: {error}") from None
     if not isinstance(before, dict):
-        raise UserError(f"{path}: expected an object with the configuration, got {before!r:.80}")
+        raise UserError(f"{path}: expected a JSON object of settings, got {before!r:.80}")
     began = _completed(before, cfg)
     # of configurations from before there were any
     since = {"downscale": 1, "voxel_pixels": 0.0}

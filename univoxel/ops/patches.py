@@ -234,7 +234,7 @@ def match_cost(
         raise ValueError(f"match_cost: best must lie in [1, {sizes['M']}], got {best}")
     if steps < 1 or radius < 0:
         raise ValueError(
-            f"match_cost: steps must be at least 1 and radius at least 0, got {steps} and {radius}"
+            f"match_cost: expected steps >= 1 and radius >= 0, got {steps=} and {radius=}"
         )
     rays = (origin, direction, start, color, rows, others)
     if not native.serves(start):
@@ -317,7 +317,7 @@ def semi_global(cost: Tensor, rows: Tensor, small: float, large: float) -> Tenso
     sizes = check("semi_global", cost=(cost, "N K", torch.float32), rows=(rows, "H W", torch.int64))
     _check_rows("semi_global", rows, sizes["N"])
     if not 0 <= small <= large:
-        raise ValueError(f"semi_global: 0 <= small <= large, got {small} and {large}")
+        raise ValueError(f"semi_global: 0 <= small <= large must hold, got {small} and {large}")
     if not native.serves(cost):
         return semi_global_reference(cost, rows, small, large)
     cost, rows = cost.contiguous(), rows.contiguous()

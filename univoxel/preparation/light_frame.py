@@ -137,9 +137,9 @@ def say_strays(photos: Photos) -> None:
     found = strays.nonzero()[:, 0].tolist()
     names = ", ".join(photos.names[view] for view in found[:NAMED])
     log.warning(
-        "%d of %d photographs were placed off the circle of their turntable, by up to %.1f "
-        "degrees, the others by a median of %.1f. Surfaces that only %s%s show will not fit; to "
-        "find all poses again, run `univoxel poses` with their masks; see cameras",
+        "%d of %d camera poses are up to %.1f degrees off the circle around the turntable (the "
+        "others: %.1f in the median). Surfaces that only %s%s show will not fit; to find all "
+        "poses again, run `univoxel poses` with the photographs' masks; see cameras",
         len(found),
         len(photos),
         math.degrees(float(circle.off[strays].max())),
@@ -230,7 +230,7 @@ def light_frame_of(
         if turntable is None:
             raise DataError(
                 f"{photos.folder}: light_frame turntable: the cameras are not around one upright "
-                "axis, so the turntable's axis is unknown",
+                "axis, so the axis of the turntable is unknown",
                 "light_frame",
             )
         return LightFrame(turntable)
