@@ -71,7 +71,7 @@ def test_a_failure_is_recorded_and_the_rest_goes_on(out):
     assert re.match("[A-Za-z]+Error: Overflow", outcome.error)
     assert not outcome.measures
     failed = runner.failures([outcome, load_outcome(out / "ball" / "small")])
-    assert failed.startswith("1 of 2 trainings failed; ")
+    assert failed.startswith("1 of 2 training runs failed; ")
     assert f"ball/dies: {outcome.error}" in failed
 
 

@@ -140,7 +140,7 @@ def test_rembg_goes_first(home, monkeypatch, caplog):
         raise ConnectionError("no network")
 
     made.new_session = offline
-    with pytest.raises(DataError, match=r"expected u2netp; the download failed: no network"):
+    with pytest.raises(DataError, match=r"could not download the weights of u2netp: no network"):
         module.mask_network()
 
 

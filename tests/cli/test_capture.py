@@ -80,7 +80,7 @@ def test_the_same_again_only_says_what_is_there(captured, photographs, caplog):
     said = [r.getMessage() for r in caplog.records]
     there = ("cameras", "masks", "training", "mesh", "pictures")
     for n, step in enumerate(there, 1):
-        assert said[n - 1].startswith(f"step {n} of 6, {step}: there already, {out}")
+        assert said[n - 1].startswith(f"step {n} of 6, {step}: already done, see {out}")
     assert said[5] == f"step 6 of 6, page: {out}/index.html"
     assert all(line.startswith("mesh: ") for line in said[6:])  # of the page's
     after = files_of(out)
@@ -165,7 +165,7 @@ def test_a_mask_that_was_mended_is_told(captured, photographs, caplog):
             capturing.make(photographs, out)
     finally:
         os.utime(edited, ns=times)
-    assert f"photographs in {(out / 'cut').absolute()} have changed" in caplog.text
+    assert f"{(out / 'cut').absolute()} has changed" in caplog.text
 
 
 def test_a_newer_run_makes_mesh_and_pictures_anew(captured, photographs, tmp_path, monkeypatch):
@@ -199,12 +199,12 @@ def test_a_run_takes_the_place_of_three_steps(captured, tmp_path, caplog):
     assert {p.name for p in made.page.parent.iterdir()} == {
         *("again.glb", "steps.json", "index.html", "pictures")
     }
-    assert f"step 3 of 6, training: there already, {captured.run}" in caplog.text
+    assert f"step 3 of 6, training: already done, see {captured.run}" in caplog.text
     with pytest.raises(UserError, match="is a trained run: masks, network, box, preset"):
         task.capture(captured.run, tmp_path / "other", minutes=2.0)
     with pytest.raises(UserError, match="is a trained run: masks"):
         task.capture(captured.run, tmp_path / "other", masks="none")
-    with pytest.raises(UserError, match="until: expected page, got masks"):
+    with pytest.raises(UserError, match="until must be page, got masks"):
         task.capture(captured.run, tmp_path / "other", until="masks")
     assert not (tmp_path / "other").exists()
 
@@ -337,7 +337,7 @@ def test_another_box_makes_other_masks(steps, pictures, tmp_path, monkeypatch):
     with pytest.raises(ExistingFile, match=said):
         task.find_data(pictures, out, masks="none", box=box)
     scene = task.SCENE
-    with pytest.raises(UserError, match="has masks, which training uses unchanged: with a"):
+    with pytest.raises(UserError, match="has masks already, so box would have no effect"):
         task.find_data(scene, tmp_path / "other", box=box)
 
 
@@ -367,7 +367,7 @@ def test_the_first_steps_alone(steps, pictures, tmp_path):
     assert [name for name, *_ in steps] == ["poses", "cutout"]
     assert task.capture(pictures, out, masks="none").page.exists()  # goes on with them
     assert [name for name, *_ in steps] == ["poses", "cutout", "train"]
-    with pytest.raises(UserError, match="is a trained run with cameras and masks"):
+    with pytest.raises(UserError, match="is a trained run, which has cameras and masks"):
         task.find_data(out / "run", tmp_path / "other")
 
 

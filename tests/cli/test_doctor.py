@@ -66,12 +66,12 @@ def test_a_build_without_embree(without_embree, capsys):
 
 def test_no_build_at_all(monkeypatch):
     monkeypatch.setattr(native, "core", None)
-    monkeypatch.setattr(native, "variant", "no extension built under /here")
+    monkeypatch.setattr(native, "variant", "no compiled extension in /here")
     status = native_status()
     assert (status.loaded, status.variant, status.embree) == (False, None, None)
-    assert status.reason == "no extension built under /here"
+    assert status.reason == "no compiled extension in /here"
     finding = doctor.kernels(status)
-    assert (finding.state, finding.found) == ("bad", "not loaded: no extension built under /here")
+    assert (finding.state, finding.found) == ("bad", "not loaded: no compiled extension in /here")
     with pytest.raises(MissingNative, match=r"kernels: not loaded: .* Embree: none"):
         doctor.check([finding, doctor.embree(status)])
 

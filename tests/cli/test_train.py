@@ -200,9 +200,7 @@ def test_a_model_of_colmap_in_a_world_of_its_own(tmp_path, caplog):
     data = write_colmap(tmp_path / "data", written, parameters=(focal, 32.0, 32.0))
     stages = (plain_stage(voxels=0.01, iterations=40, share=1.0, rays=256),)
     out = train(config(data, tmp_path / "run", stages=stages, downscale=2))
-    said = (
-        "COLMAP model, 14 photographs of 32x32 pixels in train, downscaled to 1/2, world turned to"
-    )
+    said = "14 photographs of 32x32 pixels in train, downscaled to 1/2, world rotated so"
     assert said in caplog.text
     mesh = extract_mesh(load_scene(out))
     middle = (mesh.vertices.amin(0) + mesh.vertices.amax(0)) / 2
@@ -350,7 +348,7 @@ def test_a_stage_without_a_step_is_said_and_ends_with_code_3(data, tmp_path, mon
     options = ["--out", str(tmp_path / "run"), "--config", str(tmp_path / "config.json")]
     assert main(["train", str(data), *options]) == 3
     said = capsys.readouterr().out
-    assert "the time limit was too short: of the planned steps it made 0% for" in said
+    assert "the time limit was too short (completed steps: 0% of" in said
     assert "minutes 0.0001 are enough for about 0% of the steps, --minutes 1 for all" in said
     verdict = load_verdict(tmp_path / "run")
     assert verdict.empty

@@ -244,8 +244,11 @@ BROKEN = {
     "double name": (frame(file_path="./train/r_0.png"), "frame 1: the name r_0 .* occurs twice"),
     "distortion by k4": (frame(k4=0.1), "frame 1: expected distortion k1 k2 k3 p1 p2, got k4"),
     "distortion in words": (frame(k2="no"), "frame 1: expected k2 between -inf and inf, got 'no'"),
-    "too much distortion": (root(k1=20.0), "frame 0: its distortion leaves less than 1/2"),
-    "folding distortion": (root(k1=-10.0, k2=30.0), "frame 0: its distortion folds the image over"),
+    "too much distortion": (root(k1=20.0), "frame 0: the lens distortion leaves less than 1/2"),
+    "folding distortion": (
+        root(k1=-10.0, k2=30.0),
+        "frame 0: the lens distortion folds the image over",
+    ),
     "a fisheye": (root(is_fisheye=True), "frame 0: expected one of the camera models .* a fisheye"),
     "another camera": (frame(camera_model="EQUIRECTANGULAR"), "models .* got 'EQUIRECTANGULAR'"),
     "size unlike the file's": (root(w=60, h=30), r"images of 60x30 pixels \(w and h\), got 6x4"),
@@ -276,7 +279,7 @@ BROKEN = {
         "frame 0: expected a rigid",
     ),
     "mirrored": (matrix(lambda m: m * [-1, 1, 1, 1]), "frame 0: expected a rotation .* reflection"),
-    "transposed": (matrix(lambda m: m.T), "frame 0: expected the last row 0 0 0 1"),
+    "transposed": (matrix(lambda m: m.T), "frame 0: transform_matrix must end with 0 0 0 1"),
     "no angle": (
         lambda f: edit(f, lambda t: t.pop("camera_angle_x")),
         "frame 0: expected camera_angle_x between 0 and 3.142, got nothing",

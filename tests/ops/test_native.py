@@ -43,8 +43,8 @@ def test_a_missing_extension_is_told_once(monkeypatch, caplog):
     call()
     call()
     assert warned(caplog) == [
-        "univoxel.ops runs in eager torch, many times slower: the compiled extension is not "
-        "loaded: no extension built"
+        "univoxel.ops uses eager PyTorch, which is many times slower: the compiled extension is "
+        "not loaded: no extension built"
     ]
 
 

@@ -120,7 +120,7 @@ def read_shots(
     pixels = kept_pixels(origin) if origin else None
     color, alpha = pixels or _read_all(folder, shots, pinholes, cameras, factor, masks, origin)
 
-    told = [f"{len(shots)} {split} photographs of {_words(cameras)} pixels"]
+    told = [f"{len(shots)} photographs of {_words(cameras)} pixels in {split}"]
     told += ["lens distortion removed"] if any(shot.lens.bent for shot in shots) else []
     told += [f"downscaled to 1/{factor}"] if factor > 1 else []
     return Photos(
