@@ -48,7 +48,7 @@ class StageConfig:
     """A stage of training at one grid resolution. Pairs are values at the start and the end."""
 
     voxels: float = field(
-        metadata=about("at most, in the object's box; see voxel_pixels", unit="millions", above=0)
+        metadata=about("maximum in the object's box; see voxel_pixels", unit="millions", above=0)
     )
     iterations: int = field(metadata=about("optimisation steps; fewer if time runs out", least=1))
     share: float = field(
@@ -59,7 +59,7 @@ class StageConfig:
         (0.5, 0.3), "s of the NeuS density at the start and the end", unit="voxels", above=0
     )
     lr_sdf: tuple[float, float] = setting(
-        (0.07, 0.005), "learning rate at the start and the end", unit="voxels per step", above=0
+        (0.07, 0.005), "learning rate of the sdf, start and end", unit="voxels per step", above=0
     )
     lr_features: tuple[float, float] = setting(
         (0.1, 0.01), "learning rate of features and the table of reflections", above=0
@@ -80,7 +80,7 @@ class StageConfig:
     patches_from: float = setting(
         0.0, "progress at which patches are compared between photographs", least=0, most=1
     )
-    refit: bool = setting(False, "freeze materials; fit light, radiance, silhouettes")
+    refit: bool = setting(False, "freeze the materials; fit light, radiance and shape")
     field: FieldName = setting(
         "hash", "storage of features: every grid node, bricks at the surface, or a hash table"
     )
@@ -95,11 +95,11 @@ class LossConfig:
     radiance: float = setting(1.0, "photometric loss of the radiance head's render", least=0)
     silhouette: float = setting(0.1, "difference between ray opacity and masks", least=0)
     metallic: float = setting(0.01, "penalty on the mean metallic value", least=0)
-    light_smoothness: float = setting(0.1, "L1 change of local light over about a voxel", least=0)
+    light_smoothness: float = setting(0.1, "L1 norm of local light's change over a voxel", least=0)
     white_light: float = setting(0.01, "relative distance of the mean light from grey", least=0)
     map_smoothness: float = setting(1e-3, "total variation of the log environment map", least=0)
     patches: float = setting(
-        0.4, "missing correlation of patches between photographs, every second step", least=0
+        0.4, "1 - correlation of patches between photographs, in every second step", least=0
     )
 
     __post_init__ = check_settings
@@ -162,7 +162,7 @@ class TrainConfig:
         metadata=about("stages in order; the first is a StageConfig, which creates the grid")
     )
     minutes: float | None = setting(
-        None, "time limit, including preparation; stages are shortened alike to fit", above=0
+        None, "time limit, including preparation; stages are shortened equally to fit", above=0
     )
     downscale: int = setting(
         0, "train at 1/N of the photographs' size; 0: no more pixels than grids can use", least=0
@@ -184,7 +184,7 @@ class TrainConfig:
     light_frame: LightFrameOrAuto = setting(
         "auto",
         "world: the light is fixed; turntable: it moves with the camera, see scene.turntable; "
-        "camera: a flash, see scene.flash; auto: the best explanation of colour changes",
+        "camera: a flash, see scene.flash; auto: whichever explains the colour changes best",
     )
     detail: Detailing = setting(
         "texture", "texture: refine the albedo from full-size photographs after training"
@@ -197,7 +197,7 @@ class TrainConfig:
     )
     patience: float = setting(
         0.0,
-        "validation gain in 15 % of a stage, below which the stage is shortened; 0: never",
+        "shorten a stage if validation gains less than this in 15 % of it; 0: never",
         unit="dB",
         least=0,
     )

@@ -39,9 +39,9 @@ from univoxel.ops.networks import DirectionTable
 class SceneConfig:
     """Sizes of the model."""
 
-    channels: int = setting(16, "features per voxel", least=1)
+    channels: int = setting(16, "number of features per voxel", least=1)
     material_channels: int = setting(
-        8, "features that albedo and roughness are decoded from", least=1
+        8, "number of features from which albedo and roughness are decoded", least=1
     )
     hidden: int = setting(64, "width of the material and radiance heads", least=1)
     mirror_levels: int = setting(5, "levels of the table of reflected directions", least=0, most=8)
@@ -63,7 +63,7 @@ class SceneConfig:
         most=1,
     )
     turntable: Turntable | None = setting(
-        None, "axes about which the light turns with the camera; None: the light stands still"
+        None, "axes about which the light rotates with the camera; None: the light is fixed"
     )
     flash: float | None = setting(
         None,
@@ -86,14 +86,14 @@ class SceneConfig:
         check_fields(self, most, lambda x: x <= self.channels, "material_channels")
         if self.turntable is not None and not isinstance(self.light, lights.LocalLightConfig):
             raise ConfigError(
-                "SceneConfig: light that turns with the camera needs hybrid or a local lighting "
+                "SceneConfig: light that rotates with the camera needs hybrid or a local lighting "
                 f"model (sg, sh or mlp), got {self.light.kind}",
                 "light_frame",
                 "light",
             )
         if self.turntable is not None and self.varying == "light":
             raise ConfigError(
-                "SceneConfig: light that turns with the camera cannot vary as well; only "
+                "SceneConfig: light that rotates with the camera cannot vary as well; only "
                 "exposure can",
                 "light_frame",
                 "varying",

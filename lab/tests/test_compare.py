@@ -101,8 +101,7 @@ def test_without_matplotlib_nothing_is_trained(passed, tmp_path, monkeypatch, ca
     assert main(["compare", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
     assert (
-        said
-        == "univoxel lab compare: the pictures need matplotlib: pip install 'univoxel[chart]'\n"
+        said == "univoxel lab compare: the images need matplotlib: pip install 'univoxel[chart]'\n"
     )
     assert not passed
 

@@ -86,7 +86,7 @@ def test_what_is_done_is_not_done_again(data, out, trained):
 def test_results_of_other_settings_are_not_taken(data, out, trained):
     other = dataclasses.replace(SMALL, changes=(*TINY, "seed=5"))
     for settings, samples in (([other], 1), ([SMALL], 2)):
-        with pytest.raises(ValueError, match=r"small/result\.json: is of another configuration"):
+        with pytest.raises(ValueError, match=r"small/result\.json: comes from another config"):
             runner.run([data], settings, out, samples=samples)
     assert not trained
 
@@ -147,7 +147,7 @@ def test_a_killed_process_is_an_outcome(data, tmp_path, monkeypatch):
     assert load_outcome(tmp_path / "out" / "ball" / "small") == outcome
     (tmp_path / "killed.py").write_text("")
     (outcome,) = runner.run([data], [SMALL], tmp_path / "other", samples=1)
-    assert outcome.error == "left no result.json"
+    assert outcome.error == "result.json is missing"
 
 
 def test_mistakes_are_found_before_anything_is_trained(data, tmp_path, trained):

@@ -112,7 +112,7 @@ def test_a_process_that_dies_each_time_is_given_up_and_others_go_on(tmp_path):
         found = {e.name: e for e in run_jobs(client, [dies, counting(tmp_path, "mug")], 2, tries=3)}
     assert found["mug"].state == "done"
     assert found["dies"].state == "failed"
-    assert re.match("ended by SIGKILL.*memory runs out; tries: 3", found["dies"].errors["say"])
+    assert re.match("ended by SIGKILL.*memory runs out; attempts: 3", found["dies"].errors["say"])
     assert (tmp_path / "n").read_text() == "xxx"
 
 
@@ -194,7 +194,7 @@ def test_other_options_are_refused(tmp_path):
     assert run_job(job).state == "done"
     job.check_same()
     other = dataclasses.replace(job, identity={"seed": 2, "steps": 2})
-    with pytest.raises(ExistingFile, match=r"mug\.json has another seed: choose another out"):
+    with pytest.raises(ExistingFile, match=r"mug\.json is of another seed: choose another out"):
         other.check_same()
 
 

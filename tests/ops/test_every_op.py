@@ -276,12 +276,12 @@ REFUSED = {
         ({"steps": 0}, "steps >= 1 and radius >= 0, got steps=0 and radius=1"),
         ({"radius": -1}, "got steps=7 and radius=-1"),
         ({"others": torch.tensor([1, 2, 3, 5])}, r"others must lie in \[0, 5\)"),
-        ({"rows": torch.zeros(2, 6, dtype=torch.int64)}, "rows must name each of the"),
+        ({"rows": torch.zeros(2, 6, dtype=torch.int64)}, "rows must contain each of the"),
     ],
     "semi_global": [
         ({"small": 0.2, "large": 0.1}, "0 <= small <= large, got 0.2 and 0.1"),
         ({"small": -0.1}, "got -0.1 and 0.2"),
-        ({"rows": torch.full((2, 6), -1)}, "rows must name each of the"),
+        ({"rows": torch.full((2, 6), -1)}, "rows must contain each of the"),
     ],
     "smooth_rows_": [
         *(({"rows": torch.tensor([x])}, r"rows must lie in \[0, 180\)")

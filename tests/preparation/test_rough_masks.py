@@ -94,7 +94,7 @@ def test_of_plain_objects_silhouettes_alone_tell_masks_from_cameras(photos, capl
         found = choose_masks_or_poses(spoilt, distance, "auto", "auto")
     assert not found.refined
     assert found.votes > 1
-    assert "pose refinement does not help: the masks are taken to be rough" in caplog.text
+    assert "pose refinement does not help: the masks are assumed to be rough" in caplog.text
     # What is told is believed
     assert choose_masks_or_poses(spoilt, distance, "refined", "auto").refined
     assert choose_masks_or_poses(spoilt, distance, "auto", "given").refined

@@ -29,11 +29,10 @@ class CaptureConfig:
     seed: int = setting(0, "random seed", least=0)
     exhaustive: int = setting(
         24,
-        "maximum number of photographs of which all pairs are matched; with more, a coarse "
-        "comparison selects the pairs",
+        "up to this number of photographs, all pairs are matched; beyond, only similar ones",
         least=2,
     )
-    partners: int = setting(16, "pairs per photograph that are then matched in full", least=1)
+    partners: int = setting(16, "number of similar photographs to match with each", least=1)
 
     __post_init__ = check_settings
 

@@ -138,8 +138,7 @@ def command(asked: Relight) -> Path:
     options = {field.name: getattr(asked, field.name) for field in fields(RelightOptions)}
     if asked.orbit is not None:
         if asked.cameras != "test":
-            both = f"--orbit {asked.orbit} and --cameras {asked.cameras}"
-            raise UserError(f"expected --orbit or --cameras, got {both}")
+            raise UserError("expected --orbit or --cameras, but not both")
         options["cameras"] = f"orbit {asked.orbit}"
     if out is None:
         out = run / "relight" / envmap[0].stem if len(envmap) == 1 else run / "relight"

@@ -240,7 +240,7 @@ def report_text(
     sections = [
         ("Result", paragraph(verdict.sentence() + ".") if verdict else ""),
         ("What to photograph next", next_section(known.advice) if known else paragraph(why)),
-        ("Doubt", doubt_section(known, state, pictures.pop("doubt", [])) if known else ""),
+        ("Uncertainty", doubt_section(known, state, pictures.pop("doubt", [])) if known else ""),
         ("Photographs and renders", views_section(scene, known, options) if known else ""),
         ("Materials", materials_section(pictures)),
         ("Light", light_section(scene, mesh)),
@@ -300,8 +300,8 @@ def next_section(advice: Advice) -> str:
     legend = (
         "Directions around the object, seen from above. White dots: photographs. Bright: a "
         "photograph from there would help. Rings: gaps without photographs. Numbers: "
-        "photographs to take, the best first. Worth: the share of the surface that a photograph "
-        "would resolve at most."
+        "photographs to take, the best first. Worth: the largest share of the surface that a "
+        "photograph could resolve."
     )
     left = "\n".join(parts)
     figure = f"<figure>{report_pictures.sphere(advice)}<figcaption>{legend}</figcaption></figure>"

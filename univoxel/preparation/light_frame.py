@@ -242,7 +242,7 @@ def light_frame_of(
     if (flashed.shade > SHADE or flashed.glint > GLINT) and flashed.ahead > CERTAIN:
         log.info(
             "light: a flash at the camera, which explains %.0f %% more of the colour changes "
-            "between photographs than a light that stands still; see light_frame",
+            "between photographs than a fixed light; see light_frame",
             100 * flashed.saved,
             extra={"arguments": ("light_frame",)},
         )
@@ -259,8 +259,8 @@ def light_frame_of(
     if not still_around and found.saved < LEAST:
         return LightFrame()
     log.info(
-        "light: it turns with the camera, as on a turntable%s; that explains %.0f %% of the "
-        "colour changes between photographs, a light that stands still %.0f %%; see light_frame",
+        "light: it rotates with the camera, as on a turntable%s; this explains %.0f %% of the "
+        "colour changes between photographs, a fixed light explains %.0f %%; see light_frame",
         f", with {len(turntable.tables)} positions of the object" if turntable.others else "",
         100 * found.by_turning_light,
         100 * max(found.by_still_light, 0.0),  # none, where the other half contradicts it
