@@ -49,7 +49,7 @@ def test_fine_stages_may_be_sparse():
     dense = with_field(preset("fast", Path("photos"), Path("run")), "dense")
     assert with_field(config, "dense") == replace(dense, capacity="fixed")
     assert dense.capacity == "adaptive"
-    with pytest.raises(ValueError, match="dense stages must come before .*, got sparse, d"):
+    with pytest.raises(ValueError, match=r"dense stages must come before .*, got sparse, d"):
         replace(CONFIG, stages=(replace(STAGE, field="sparse"), STAGE))
 
 

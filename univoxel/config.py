@@ -124,7 +124,7 @@ class JointConfig:
     share: float = setting(0.27, "share of the time limit", above=0, most=1)
     rays: int = setting(2048, "observations per step, no fewer than views")
     views: int = setting(4, "observations of a point per step", least=1)
-    rounds: int = setting(4, "rounds of Newton steps on the map and Adam steps", least=1)
+    rounds: int = setting(4, "rounds, each of Newton steps on the map, then Adam steps", least=1)
     points: int = setting(20400, "number of surface points", least=1)
     tracing: int = setting(2, "visibility rays per point and direction", least=1)
     colors: bool = setting(True, "minimise the entropy of the albedo; see entropy")
@@ -133,7 +133,7 @@ class JointConfig:
     )
     lr_features: float = setting(0.03, "learning rate of features at the start of a round", above=0)
     lr_networks: float = setting(
-        3e-3, "learning rate of material head and gains at the start of a round", above=0
+        3e-3, "learning rate of the material head and the gains at the start of a round", above=0
     )
     lr_map: float = setting(0.05, "learning rate of the log environment map", above=0)
     lr_sdf: float = setting(
@@ -176,7 +176,7 @@ class TrainConfig:
         "auto", "refined: optimise camera poses; auto: only if silhouettes are inconsistent"
     )
     exposures: bool = setting(
-        True, "look for different exposures; if found, scene.varying none becomes exposure"
+        True, "look for different exposures; if found, scene.varying changes from none to exposure"
     )
     allow_outside: bool = setting(
         False, "also read files outside the folder if the data set refers to them"

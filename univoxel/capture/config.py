@@ -32,7 +32,7 @@ class CaptureConfig:
         "up to this number of photographs, all pairs are matched; beyond, only similar ones",
         least=2,
     )
-    partners: int = setting(16, "number of similar photographs to match with each", least=1)
+    partners: int = setting(16, "number of similar photographs to match with each one", least=1)
 
     __post_init__ = check_settings
 

@@ -38,7 +38,7 @@ class BatchOptions:
     masks: Annotated[str, parsing.written("auto|rembg|FOLDER|none")] = "auto"
     """how the step masks makes them, as in capture"""
     preset: choices.PresetOrAuto = "auto"
-    """amount of work, from draft to best; auto: what fits --minutes, else fast"""
+    """amount of work, from draft to best; auto: chosen to fit --minutes, else fast"""
     light: Annotated[choices.LightName, parsing.ADVANCED] = "hybrid"
     """lighting model; hybrid best keeps shadows out of the albedo, others are to compare"""
     minutes: parsing.Minutes = None

@@ -52,7 +52,7 @@ class CaptureOptions:
     keep_table: Annotated[bool, ADVANCED] = False
     """keep the table inside the box; needs --masks none"""
     preset: choices.PresetOrAuto = "auto"
-    """amount of work, from draft to best; auto: what fits --minutes, else fast"""
+    """amount of work, from draft to best; auto: chosen to fit --minutes, else fast"""
     light: Annotated[choices.LightName, ADVANCED] = "hybrid"
     """lighting model; hybrid best keeps shadows out of the albedo, others are to compare"""
     minutes: Minutes = None

@@ -112,7 +112,7 @@ def export(asked: ExportOptions) -> list[Path]:
 
     Raises:
         UserError: the run cannot be used, an argument is out of range, there is
-            no surface, or none that can be closed.
+            no surface, or it cannot be closed.
         MissingExtra: .usdz without usd-core.
         OSError: a file cannot be written.
     """

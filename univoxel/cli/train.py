@@ -28,7 +28,7 @@ class TrainOptions:
     out: Annotated[parsing.File, parsing.written("RUN")]
     """folder to write the run to"""
     preset: choices.PresetOrAuto = "auto"
-    """amount of work, from draft to best; auto: what fits --minutes, else fast"""
+    """amount of work, from draft to best; auto: chosen to fit --minutes, else fast"""
     light: Annotated[choices.LightName, parsing.ADVANCED] = "hybrid"
     """lighting model; hybrid best keeps shadows out of the albedo, others are to compare"""
     varying: Annotated[choices.Differing, parsing.ADVANCED] = "auto"

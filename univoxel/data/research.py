@@ -375,7 +375,8 @@ def _shot(view: Path, picture: str) -> Shot:
         raise
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(
-            f"{path}: expected JSON with cam_transform_mat, numbers with commas, got {error!r}"
+            f"{path}: expected JSON with cam_transform_mat, numbers separated by commas, got "
+            f"{error!r}"
         ) from None
     if len(values) != 16:
         raise DataError(f"{path}: expected 16 numbers in cam_transform_mat, got {short(text)}")

@@ -255,7 +255,7 @@ class Turntable(Table):
     show its underside, has another axis for the photographs since then.
     """
 
-    others: tuple[Table, ...] = setting((), "axes of the object's other positions, each with eyes")
+    others: tuple[Table, ...] = setting((), "rotation axes of the object's other positions")
 
     def __post_init__(self) -> None:
         super().__post_init__()
