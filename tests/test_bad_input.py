@@ -182,7 +182,10 @@ def nan(tensor):
         (meta(lambda m: m["state"].update(stage="last")), "stage must be int"),
         (meta(lambda m: m["state"].update(progress=2)), r"progress must be in \[0, 1\]"),
         (meta(lambda m: m["state"].update(chosen=[{"what": 1}])), "what must be str"),
-        (edited_tensor("material.net.0.weight", nan), "NaN or infinity in material.net.0.weight"),
+        (
+            edited_tensor("material.net.0.weight", nan),
+            "material.net.0.weight contains NaN or infinity",
+        ),
         (
             edited_tensor("material.net.0.weight", lambda t: None),
             "material.net.0.weight is missing",

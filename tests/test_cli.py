@@ -365,7 +365,7 @@ def test_experiments(calls, tmp_path, capsys):
     assert "--minutes must be above 0, got -1" in capsys.readouterr().err
     calls.give("lab.chart", chart=calls.task("chart", KeyboardInterrupt()))
     assert main(["chart", "cup", "--out", "out"]) == 130
-    assert "finished trainings are in out" in capsys.readouterr().err
+    assert "finished runs are in out" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -460,8 +460,8 @@ def test_output_that_nobody_reads_to_its_end(arguments):
         (["--minutes", "0"], "--minutes must be above 0, got 0"),
         (["--minutes", "nan"], "--minutes must be above 0, got nan"),
         (["--set", "seed"], "--set seed: expected FIELD=VALUE"),
-        (["--set", "sede=1"], "--set sede=1: no field 'sede', there are: data, out, stages"),
-        (["--set", "seed.x=1"], "--set seed.x=1: no field 'x', there are: none"),
+        (["--set", "sede=1"], "--set sede=1: no field 'sede'; the fields are: data, out, stages"),
+        (["--set", "seed.x=1"], "--set seed.x=1: no field 'x'; the fields are: none"),
         (["--set", "seed=fast"], "--set seed=fast: expected a int such as 0, got 'fast'"),
         (["--set", "stages.4.voxels=1"], "--set stages.4.voxels=1: no field '4', there are: 0, 1"),
     ],
@@ -530,7 +530,7 @@ def test_without_a_clone_there_is_no_laboratory(calls, monkeypatch, tmp_path, ca
     monkeypatch.setattr(cli, "CLONE", tmp_path)
     assert main(arguments) == 2
     out, err = capsys.readouterr()
-    assert err.startswith("univoxel: compare, chart, stress, bank, submit are experiments, which")
+    assert err.startswith("univoxel: compare, chart, stress, bank, submit run experiments, which")
     assert err.count("\n") == 1
     assert not out
     assert main(["completion", "bash"]) == 0

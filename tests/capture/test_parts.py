@@ -132,7 +132,7 @@ def test_reasons_of_photographs_without_a_place():
     assert why_not(None, features, pairs, {}) == "no features that can be matched"
     assert why_not(1, features, pairs, {}) == "no features that can be matched"
     assert why_not(2, features, pairs, {}) == "12 matches with its best partner; 15 are needed"
-    assert why_not(3, features, pairs, {3: 4}).startswith("connected to 4 others")
+    assert why_not(3, features, pairs, {3: 4}).startswith("connected to 4 photographs")
     assert why_not(4, features, pairs, {}) == (
         "80 matches with its best partner, which disagree with the others"
     )

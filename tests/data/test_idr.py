@@ -111,7 +111,7 @@ def leaning(arrays):
         (edited(lambda a: a.update(world_mat_2=np.eye(3))), r"npz: expected world_mat_2 \[4, 4\]"),
         (
             edited(lambda a: a.update(world_mat_2=np.full((4, 4), "a"))),
-            "npz: expected arrays of numbers, got world_mat_2 of <U1",
+            "npz: expected arrays of numbers, but world_mat_2 is of type <U1",
         ),
         (
             edited(lambda a: a.update(world_mat_2=np.full((4, 4), np.nan))),

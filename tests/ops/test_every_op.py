@@ -279,7 +279,7 @@ REFUSED = {
         ({"rows": torch.zeros(2, 6, dtype=torch.int64)}, "rows must contain each of the"),
     ],
     "semi_global": [
-        ({"small": 0.2, "large": 0.1}, "0 <= small <= large, got 0.2 and 0.1"),
+        ({"small": 0.2, "large": 0.1}, "0 <= small <= large must hold, got 0.2 and 0.1"),
         ({"small": -0.1}, "got -0.1 and 0.2"),
         ({"rows": torch.full((2, 6), -1)}, "rows must contain each of the"),
     ],

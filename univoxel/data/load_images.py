@@ -235,7 +235,7 @@ def _read_all(
                 reading = Reading.begun(origin, color, alpha, size)
             if color.dtype != reading.color.dtype:
                 raise DataError(
-                    f"{shots[view].image}: expected all photographs with the number of bits of "
+                    f"{shots[view].image}: expected all photographs in the format of "
                     f"{shots[0].name}"
                 )
             if alpha.dtype != reading.alpha.dtype:
