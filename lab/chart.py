@@ -65,14 +65,14 @@ def chart(
 
     Args:
         scenes: folders of data sets with different names.
-        out: folder that keeps every training in SCENE/SETTING; later calls reuse them.
+        out: folder that keeps every training run in SCENE/SETTING; later calls reuse them.
         preset: preset to vary.
         light: lighting model.
         quick: draft, the preset and three variants.
         only: names of settings; empty: all.
-        changes: FIELD=VALUE of the configuration, for all trainings.
+        changes: FIELD=VALUE of the configuration, for all training runs.
         samples: light samples per pixel of relit images.
-        jobs, scheduler: trainings at once, or a Dask scheduler; see runner.run_pairs.
+        jobs, scheduler: number of runs at a time, or a Dask scheduler; see runner.run_pairs.
 
     Returns:
         out/chart.png.
@@ -80,14 +80,14 @@ def chart(
     Raises:
         UserError: a scene or an argument cannot be used; nothing was trained.
         MissingExtra: matplotlib or Dask is missing.
-        ProcessFailed: trainings failed; what came through is in the files.
+        ProcessFailed: some training runs failed; the files contain the results of the others.
         OSError: a file cannot be written.
     """
     plots.require()
     chosen = settings(preset, light, tuple(changes))
     wanted = only or ((*dict.fromkeys(("draft", preset)), *QUICK) if quick else tuple(chosen))
     if unknown := [name for name in wanted if name not in chosen]:
-        raise UserError(f"only must be of {', '.join(chosen)}, got {', '.join(unknown)}", "only")
+        raise UserError(f"only must be among {', '.join(chosen)}, got {', '.join(unknown)}", "only")
     outcomes = runner.run(
         scenes, [chosen[name] for name in wanted], out, samples, at_once=jobs, scheduler=scheduler
     )
@@ -168,8 +168,8 @@ def plot(outcomes: Sequence[Outcome], stem: Path) -> list[Path]:
     made = plots.machine()
     legend = ", ".join(f"{mark} {name}" for name, mark in marks.items() if name != mark)
     figure.suptitle(
-        f"{made['threads']} threads of {made['processor']}. Line: Pareto front. Grey: published, "
-        f"on other data and on GPUs.\n{legend}",
+        f"{made['threads']} threads of {made['processor']}. Line: Pareto front. Grey: published "
+        f"results on other data and on GPUs.\n{legend}",
         size=9,
         wrap=True,
     )

@@ -28,7 +28,7 @@ def submit(
     samples: Annotated[int, written("N")] = SAMPLES,
     bounces: Annotated[int, written("N")] = BOUNCES,
 ) -> None:
-    """Write the files that the Stanford-ORB benchmark measures.
+    """Write the files that the Stanford-ORB benchmark evaluates.
 
     The run must have been trained on a scene of the benchmark.
 
@@ -55,22 +55,22 @@ def compare(
     jobs: AtOnce = 1,
     scheduler: Scheduler = None,
 ) -> None:
-    """Train scenes with every lighting model, side by side.
+    """Train scenes with every lighting model and compare the results.
 
     Writes DIR/compare.md, compare.json, compare.png and compare.svg. DIR/SCENE/LIGHT keeps each
-    training with its metrics (result.json): run the same command again to resume, or to retry
-    failed trainings. Trainings run one after another, each in its own process. Run nothing else
-    meanwhile, because that would distort the times.
+    training run with its metrics (result.json): run the same command again to resume, or to retry
+    failed runs. They run one after another, each in its own process. Run nothing else meanwhile,
+    because that would distort the times.
 
     Args:
         scenes: folders of photographs
         out: folder to write to
         preset: amount of work, from draft to best
-        light: lighting models; sg:lobes=12,hidden=32 also changes two fields
-        minutes: time limit of each training
+        light: lighting models; sg:lobes=12,hidden=32 also sets two fields of sg
+        minutes: time limit of each training run
         samples: light samples per pixel of relit images
-        set: change one configuration field of all trainings; repeatable
-        jobs: trainings at once; more than one distorts the times
+        set: change one configuration field of all training runs; repeatable
+        jobs: number of training runs at a time; more than one distorts the times
         scheduler: Dask scheduler to use; anyone who can reach it can run code on its workers
     """
     from lab import compare as experiment
@@ -93,25 +93,25 @@ def chart(
     jobs: AtOnce = 1,
     scheduler: Scheduler = None,
 ) -> None:
-    """Draw quality against training time, for presets and variants.
+    """Plot quality against training time, for presets and variants.
 
     Trains draft, fast, full and best, and variants of --preset that change one setting:
     voxels-x0.5 (half the voxels of the finest grid), voxels-x2, rays-x0.5 (half the rays per step),
-    rays-x2, the same for steps, directions and lobes, light-sg and so on. Writes DIR/chart.png,
-    chart.svg and chart.json with every metric, the log of each training, and the Pareto front of
-    each metric. Published figures are marked; they come from other data and from GPUs. Finished
-    trainings are kept: run the same command again to resume.
+    rays-x2, the same for steps, directions and lobes, and light-NAME for other lighting models.
+    Writes DIR/chart.png, chart.svg and chart.json with every metric, the log of each training run,
+    and the Pareto front of each metric. Published results are drawn in grey; they come from other
+    data and from GPUs. Finished runs are kept: run the same command again to resume.
 
     Args:
         scenes: folders of photographs
         out: folder to write to
         preset: preset to vary
-        light: lighting model of all settings but light-NAME
-        quick: five settings instead of all
+        light: lighting model of all settings except light-NAME
+        quick: train five settings instead of all
         only: names of the settings to train
         samples: light samples per pixel of relit images
-        set: change one configuration field of all trainings; repeatable
-        jobs: trainings at once; more than one distorts the times
+        set: change one configuration field of all training runs; repeatable
+        jobs: number of training runs at a time; more than one distorts the times
         scheduler: Dask scheduler to use; anyone who can reach it can run code on its workers
     """
     from lab import chart as experiment
@@ -135,22 +135,22 @@ def stress(
 ) -> None:
     """Find the limits of the method, on scenes with ground truth.
 
-    Renders small scenes with Mitsuba 3, each harder along one axis or with degraded photographs,
-    then trains and measures. Writes DIR/stress.md with the breaking point of each axis,
+    Renders small scenes with Mitsuba 3, which become harder along one axis at a time, then trains
+    on each and measures the result. Writes DIR/stress.md with the breaking point of each axis,
     stress.json, stress.png and stress.svg.
     Axes: roughness, metal, concavity, sun, views, pose, exposure, light, masks, rough-masks, thin,
     fur, turntable, noise, placement, dark, bright; light-varying is trained with --varying light.
-    A failed training counts as a result. Finished trainings are kept: run the same command again to
+    A failed training run counts as a result. Finished runs are kept: run the same command again to
     resume.
 
     Args:
-        out: folder for scenes, photographs, trainings and results
-        quick: fewer levels of each axis
+        out: folder for scenes, photographs, training runs and results
+        quick: test fewer levels of each axis
         only: names of the axes to run
         light: lighting models
-        seeds: trainings per level, with different random seeds
-        set: change one configuration field of all trainings; repeatable
-        jobs: trainings at once; more than one distorts the times
+        seeds: training runs per level, with different random seeds
+        set: change one configuration field of all training runs; repeatable
+        jobs: number of training runs at a time; more than one distorts the times
         scheduler: Dask scheduler to use; anyone who can reach it can run code on its workers
     """
     from lab.stress import suite
@@ -171,25 +171,25 @@ def bank(
     set: Changes = (),
     jobs: AtOnce = 1,
 ) -> None:
-    """Measure quality and decisions on random scenes.
+    """Measure quality and automatic decisions on random scenes.
 
     Renders random objects, materials, light and captures with Mitsuba 3 and trains on each. Reports
     the mean quality, the share of correct decisions, and whether uncertainty predicts errors. One
     half of the scenes is for tuning and the other for judging; the seed determines which. Writes
-    DIR/seed-N/judge-NAME.md and .json. Finished trainings are kept: run the same command again to
+    DIR/seed-N/judge-NAME.md and .json. Finished runs are kept: run the same command again to
     resume.
 
     Args:
-        out: folder for scenes and trainings
+        out: folder for scenes and training runs
         render: only render the missing scenes
-        judge: only print the results of finished trainings
+        judge: only print the results of finished training runs
         half: half of the scenes to use; both if omitted
-        scenes: number of scenes in both halves together
+        scenes: total number of scenes in the two halves
         seed: random seed of the scenes
-        label: name of the trainings, to keep those of several versions apart
+        label: name of these training runs, which keeps several versions apart
         preset: amount of work, from draft to best
-        set: change one configuration field of all trainings; repeatable
-        jobs: trainings at once
+        set: change one configuration field of all training runs; repeatable
+        jobs: number of training runs at a time
     """
     from lab.bank import suite
 

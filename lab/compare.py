@@ -40,16 +40,16 @@ def compare(
     jobs: int = 1,
     scheduler: str | None = None,
 ) -> Path:
-    """Train every scene with every light; write out/compare.md, .json, .png and .svg.
+    """Train every scene with every lighting model; write out/compare.md, .json, .png and .svg.
 
     Args:
         scenes: folders of data sets with different names.
-        out: folder that keeps every training in SCENE/LIGHT; later calls reuse them.
+        out: folder that keeps every training run in SCENE/LIGHT; later calls reuse them.
         light: names, as for --light; `NAME:FIELD=VALUE[,FIELD=VALUE]` changes fields of the light.
         preset, minutes: amount of work; see presets.chosen.
-        changes: FIELD=VALUE of the configuration, for all trainings.
+        changes: FIELD=VALUE of the configuration, for all training runs.
         samples: light samples per pixel of relit images.
-        jobs, scheduler: trainings at once, or a Dask scheduler; see runner.run_pairs.
+        jobs, scheduler: number of runs at a time, or a Dask scheduler; see runner.run_pairs.
 
     Returns:
         out/compare.md.
@@ -57,7 +57,7 @@ def compare(
     Raises:
         UserError: a scene or an argument cannot be used; nothing was trained.
         MissingExtra: matplotlib or Dask is missing.
-        ProcessFailed: trainings failed; what came through is in the files.
+        ProcessFailed: some training runs failed; the files contain the results of the others.
         OSError: a file cannot be written.
     """
     plots.require()

@@ -33,14 +33,14 @@ class Measure:
 
 
 NVS = Measure("nvs_psnr", "novel views, dB", True)
-ALBEDO = Measure("albedo_psnr_3ch", "albedo, a scale per channel, dB", True)
-ALBEDO_1CH = Measure("albedo_psnr_1ch", "albedo, one scale, dB", True)
+ALBEDO = Measure("albedo_psnr_3ch", "albedo, scaled per channel, dB", True)
+ALBEDO_1CH = Measure("albedo_psnr_1ch", "albedo, scaled by one factor, dB", True)
 ROUGHNESS = Measure("roughness_mse", "roughness MSE", False, ".4f")
 RELIT = Measure("relit_psnr", "relit, dB", True)
 NORMAL = Measure("normal_mae_deg", "normals, degrees", False)
 MAP = Measure("map_ball_psnr", "diffuse sphere under the map, dB", True)
 SECONDS = Measure("train_seconds", "training, s", False, ".0f")
-STEPS = Measure("steps_made", "steps made", True, ".0%")
+STEPS = Measure("steps_made", "planned steps completed", True, ".0%")
 MEMORY = Measure("peak_rss_mb", "peak memory, MB", False, ".0f")
 PARAMETERS = Measure("parameters", "parameters", False, ",.0f")
 

@@ -59,11 +59,11 @@ class Outcome:
     def __post_init__(self) -> None:
         check_fields(self, "text", lambda x: isinstance(x, str), "scene", "setting")
         check_fields(self, "text or None", lambda x: isinstance(x, str | None), "error")
-        check_fields(self, "an object", lambda x: isinstance(x, dict), "identity")
-        check_fields(self, "a number by name", _is_measures, "measures")
+        check_fields(self, "a JSON object", lambda x: isinstance(x, dict), "identity")
+        check_fields(self, "a JSON object of numbers", _is_measures, "measures")
         check_fields(
             self,
-            "a list of objects",
+            "a list of JSON objects",
             lambda x: isinstance(x, list) and all(isinstance(line, dict) for line in x),
             "log",
         )
@@ -101,7 +101,7 @@ def load_outcome(folder: Path) -> Outcome | None:
     try:
         return Outcome(**read_json(path))
     except (OSError, ValueError, TypeError) as error:
-        raise DataError(f"{path}: expected the record of a training: {error}") from None
+        raise DataError(f"{path}: expected the record of a training run: {error}") from None
 
 
 def identity(config: TrainConfig, samples: int) -> dict[str, Any]:

@@ -85,7 +85,7 @@ def _run(jobs: Sequence[Job], at_once: int, scheduler: str | None) -> list[Outco
         found = load_outcome(job.files.parent)
         if found is not None and found.identity != job.identity["training"]:
             raise UserError(
-                f"{job.files.parent / RESULT}: made with another configuration or data set: "
+                f"{job.files.parent / RESULT}: comes from another configuration or data set: "
                 "remove it, or choose another out",
                 "out",
             )
@@ -106,8 +106,8 @@ def failures(outcomes: Sequence[Outcome]) -> str:
         return ""
     first = f"{failed[0].scene}/{failed[0].setting}: {failed[0].error}"
     return (
-        f"{len(failed)} of {len(outcomes)} trainings failed; run the same command again to retry "
-        f"them. The first: {first}"
+        f"{len(failed)} of {len(outcomes)} training runs failed; run the same command again to "
+        f"retry them. First failure: {first}"
     )
 
 
@@ -115,7 +115,7 @@ def _named(scenes: Iterable[Path]) -> list[Path]:
     """Scenes as absolute folders, whose names tell them apart."""
     folders = [Path(scene).resolve() for scene in scenes]
     if not folders:
-        raise UserError("expected at least one scene, a folder of photographs, got none")
+        raise UserError("expected at least one scene (a folder of photographs), got none")
     if len({folder.name for folder in folders}) < len(folders):
         names = [str(folder) for folder in folders]
         raise UserError(f"expected scene folders with different names, got {names}")

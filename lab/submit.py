@@ -56,25 +56,25 @@ TO_MAP = torch.tensor([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 def submit(
     run: str | Path, out: str | Path, samples: int = SAMPLES, bounces: int = BOUNCES
 ) -> Path:
-    """Write what Stanford-ORB metrics of a run that was trained on a scene of it; return its list.
+    """Write the images that Stanford-ORB evaluates of a run; return the file that lists them.
 
-    Views of other scenes are rendered in the light that was measured there, where the data has it.
+    Views of other scenes are rendered under the light measured there, if the data contains it.
 
     Args:
-        run: folder of the trained scene.
-        out: folder to write.
+        run: folder of a run that was trained on a scene of Stanford-ORB.
+        out: folder to write to.
         samples: light samples per pixel of relit pictures, at least 1.
         bounces: reflections between parts of the object in relit pictures, 0 for none.
 
     Raises:
-        DataError: the run or its data cannot be used, or are none of Stanford-ORB.
-        ExistingFile: out is there already.
+        DataError: the run or its data cannot be used, or the scene is not from Stanford-ORB.
+        ExistingFile: out exists already.
         UserError: samples or bounces out of range, or there is no surface.
         OSError: a file cannot be written.
     """
     if samples < 1 or bounces < 0:
         raise UserError(
-            f"submit: expected samples >= 1 and bounces >= 0, got {samples} and {bounces}",
+            f"submit: expected samples >= 1 and bounces >= 0, got {samples=} and {bounces=}",
             "samples",
             "bounces",
         )

@@ -110,7 +110,7 @@ def test_options_of_the_command_are_arguments(monkeypatch):
 
 
 def test_what_is_wrong_is_one_line(data, tmp_path):
-    with pytest.raises(TypeError, match="out must be the folder of the run"):
+    with pytest.raises(TypeError, match="out must be the folder to write"):
         univoxel.train(data)
     with pytest.raises(DataError, match="expected a folder with a scene"):
         univoxel.train(tmp_path / "nothing", tmp_path / "run")

@@ -157,19 +157,19 @@ def nan(tensor):
         (meta(lambda m: m.update(inv_s="sharp")), "inv_s must be float, got 'sharp'"),
         (meta(lambda m: m.update(inv_s=10**400)), "inv_s must be float, got 1000"),
         (meta(lambda m: m.update(inv_s=np.nan)), "inv_s must be above 0, got nan"),
-        (meta(lambda m: m.update(levels=7)), "contradict the description"),
+        (meta(lambda m: m.update(levels=7)), "do not match their description"),
         (meta(lambda m: m["levels"][2].append("fine")), "voxel_sizes must be tuple"),
         (meta(lambda m: m["levels"].__setitem__(3, 3)), "rows must be a power of two"),
         (meta(lambda m: m["levels"].__setitem__(3, 2**40)), "expected field.features with"),
         (meta(lambda m: m["grid"].update(origin=None)), "origin must be tuple"),
         (meta(lambda m: m["grid"].update(size=[10**5] * 3)), "size must be 2 or more"),
         (meta(lambda m: m["grid"].update(size=[1200] * 3)), "expected field.sdf"),
-        (meta(lambda m: m.update(scene=[])), "contradict the description"),
+        (meta(lambda m: m.update(scene=[])), "do not match their description"),
         (meta(lambda m: m["scene"].update(hidden=10**5)), "expected material.net.0.weight with"),
         (meta(lambda m: m["scene"].update(hidden=True)), "hidden must be int"),
         (meta(lambda m: m["scene"].update(more=1)), "SceneConfig: no field 'more'"),
-        (meta(lambda m: m["scene"].pop("light")), "contradict the description"),
-        (meta(lambda m: m["scene"].update(light=[])), "light must be an object"),
+        (meta(lambda m: m["scene"].pop("light")), "do not match their description"),
+        (meta(lambda m: m["scene"].update(light=[])), "light must be a JSON object"),
         (meta(lambda m: m["scene"].update(light={"kind": "candle"})), "light must be one of"),
         (meta(lambda m: m["scene"]["light"].update(rank=1)), "SGConfig: no field 'rank'"),
         (meta(lambda m: m["scene"].update(channels=0)), "channels must be at least 1"),
@@ -178,11 +178,14 @@ def nan(tensor):
             meta(lambda m: m["scene"]["light"].update(directions_eval=10**9)),
             r"directions_eval must be in \[1, 65536\]",
         ),
-        (meta(lambda m: m.update(state=[1])), "contradict the description"),
+        (meta(lambda m: m.update(state=[1])), "do not match their description"),
         (meta(lambda m: m["state"].update(stage="last")), "stage must be int"),
         (meta(lambda m: m["state"].update(progress=2)), r"progress must be in \[0, 1\]"),
         (meta(lambda m: m["state"].update(chosen=[{"what": 1}])), "what must be str"),
-        (edited_tensor("material.net.0.weight", nan), "NaN or infinity in material.net.0.weight"),
+        (
+            edited_tensor("material.net.0.weight", nan),
+            "material.net.0.weight contains NaN or infinity",
+        ),
         (
             edited_tensor("material.net.0.weight", lambda t: None),
             "material.net.0.weight is missing",
@@ -265,5 +268,5 @@ def test_the_template_is_sound(run, tmp_path):
     assert names == {p.name for p in out.iterdir()}
     assert {"doubt.albedo", "doubt.roughness"} <= set(read_exr(out / "r_0.exr"))
     assert 0 <= json.loads((out / "a.json").read_text())["trust"]["doubt_albedo"] <= 1
-    assert "Uncertainty of the albedo" in (run / "trust.txt").read_text()
+    assert "Mean uncertainty over the surface" in (run / "trust.txt").read_text()
     assert read_image(run / "preview.png").shape == (16, 5 * 16, 3)

@@ -122,7 +122,7 @@ def test_gaps_are_told_by_side_and_by_the_photographs_beside():
     all_around = list(range(0, 360, 30))
     assert sphere.gaps(_directions(all_around), [""] * 12, 60.0) == []
     assert sphere.gaps(_directions(all_around, 12.0), [""] * 12, 60.0) == [
-        "no photograph from above 12 degrees"
+        "no photograph from more than 12 degrees above the horizon"
     ]
     turned = [(a + 70) % 360 for a in (0, 50, 100, 150, 200)]
     assert sphere.gaps(_directions(turned), names, 60.0, front=-20.0)[0].startswith(

@@ -56,8 +56,8 @@ def test_a_run_that_time_cut_is_unfinished():
     found = of(steps={"shape": 0.6, "polish": 0.0}, minutes=2.4, limit=1.0, psnr=24.0)
     assert (found.word, found.complete, found.empty) == ("unfinished", False, True)
     assert found.sentence().startswith(
-        "Result: unfinished, the time limit was too short: of the planned steps it made 60% for "
-        "shape, 0% for polish; validation PSNR 24.0 dB (26 or more is good). To improve it: train "
+        "Result: unfinished, the time limit was too short (completed steps: 60% of "
+        "shape, 0% of polish); validation PSNR 24.0 dB (26 or more is good). To improve it: train "
     )
     assert not of(steps={"shape": 0.6}).empty
     # Never a limit that was too short

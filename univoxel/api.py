@@ -268,6 +268,6 @@ def train(
             raise TypeError(f"train: expected a configuration or {', '.join(options)}, got both")
         return train_config(data, resume=resume or out is True, **watched)
     if out is None or isinstance(out, bool):
-        raise TypeError("train: out must be the folder of the run, got none")
+        raise TypeError("train: out must be the folder to write the run to, got none")
     config = TrainOptions(data=data, out=out, **options).configuration()
     return Run(train_config(config, resume=resume, **watched))

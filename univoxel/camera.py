@@ -285,8 +285,8 @@ class PoseSteps(nn.Module):
         """
         if len(cameras) != len(self):
             raise UserError(
-                f"the run was trained on {len(self)} photographs with refined cameras, got "
-                f"{len(cameras)}"
+                f"the run has refined camera poses for {len(self)} photographs, got "
+                f"{len(cameras)} photographs"
             )
         steps = self.steps if self.training else self.steps.detach()
         turn, shift = _centred(steps).split(3, 1)

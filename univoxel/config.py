@@ -48,7 +48,7 @@ class StageConfig:
     """A stage of training at one grid resolution. Pairs are values at the start and the end."""
 
     voxels: float = field(
-        metadata=about("most in the object's box; see voxel_pixels", unit="millions", above=0)
+        metadata=about("maximum in the object's box; see voxel_pixels", unit="millions", above=0)
     )
     iterations: int = field(metadata=about("optimisation steps; fewer if time runs out", least=1))
     share: float = field(
@@ -59,7 +59,7 @@ class StageConfig:
         (0.5, 0.3), "s of the NeuS density at the start and the end", unit="voxels", above=0
     )
     lr_sdf: tuple[float, float] = setting(
-        (0.07, 0.005), "learning rate at the start and the end", unit="voxels per step", above=0
+        (0.07, 0.005), "learning rate of the sdf, start and end", unit="voxels per step", above=0
     )
     lr_features: tuple[float, float] = setting(
         (0.1, 0.01), "learning rate of features and the table of reflections", above=0
@@ -80,7 +80,7 @@ class StageConfig:
     patches_from: float = setting(
         0.0, "progress at which patches are compared between photographs", least=0, most=1
     )
-    refit: bool = setting(False, "freeze materials; fit light, radiance, silhouettes")
+    refit: bool = setting(False, "freeze the materials; fit light, radiance and shape")
     field: FieldName = setting(
         "hash", "storage of features: every grid node, bricks at the surface, or a hash table"
     )
@@ -95,11 +95,11 @@ class LossConfig:
     radiance: float = setting(1.0, "photometric loss of the radiance head's render", least=0)
     silhouette: float = setting(0.1, "difference between ray opacity and masks", least=0)
     metallic: float = setting(0.01, "penalty on the mean metallic value", least=0)
-    light_smoothness: float = setting(0.1, "L1 change of local light over about a voxel", least=0)
+    light_smoothness: float = setting(0.1, "L1 norm of local light's change over a voxel", least=0)
     white_light: float = setting(0.01, "relative distance of the mean light from grey", least=0)
     map_smoothness: float = setting(1e-3, "total variation of the log environment map", least=0)
     patches: float = setting(
-        0.4, "missing correlation of patches between photographs, every second step", least=0
+        0.4, "1 - correlation of patches between photographs, in every second step", least=0
     )
 
     __post_init__ = check_settings
@@ -122,9 +122,9 @@ class JointConfig:
 
     iterations: int = setting(675, "Adam steps in all rounds; fewer if time runs out", least=1)
     share: float = setting(0.27, "share of the time limit", above=0, most=1)
-    rays: int = setting(2048, "observations per step; at least views")
+    rays: int = setting(2048, "observations per step, no fewer than views")
     views: int = setting(4, "observations of a point per step", least=1)
-    rounds: int = setting(4, "rounds of Newton steps on the map and Adam steps", least=1)
+    rounds: int = setting(4, "rounds, each of Newton steps on the map, then Adam steps", least=1)
     points: int = setting(20400, "number of surface points", least=1)
     tracing: int = setting(2, "visibility rays per point and direction", least=1)
     colors: bool = setting(True, "minimise the entropy of the albedo; see entropy")
@@ -133,7 +133,7 @@ class JointConfig:
     )
     lr_features: float = setting(0.03, "learning rate of features at the start of a round", above=0)
     lr_networks: float = setting(
-        3e-3, "learning rate of material head and gains at the start of a round", above=0
+        3e-3, "learning rate of the material head and the gains at the start of a round", above=0
     )
     lr_map: float = setting(0.05, "learning rate of the log environment map", above=0)
     lr_sdf: float = setting(
@@ -162,7 +162,7 @@ class TrainConfig:
         metadata=about("stages in order; the first is a StageConfig, which creates the grid")
     )
     minutes: float | None = setting(
-        None, "time limit, including preparation; stages are shortened alike to fit", above=0
+        None, "time limit, including preparation; stages are shortened equally to fit", above=0
     )
     downscale: int = setting(
         0, "train at 1/N of the photographs' size; 0: no more pixels than grids can use", least=0
@@ -176,28 +176,28 @@ class TrainConfig:
         "auto", "refined: optimise camera poses; auto: only if silhouettes are inconsistent"
     )
     exposures: bool = setting(
-        True, "look for different exposures; if found, scene.varying none becomes exposure"
+        True, "look for different exposures; if found, scene.varying changes from none to exposure"
     )
     allow_outside: bool = setting(
         False, "also read files outside the folder if the data set refers to them"
     )
     light_frame: LightFrameOrAuto = setting(
         "auto",
-        "world: the light stood still; turntable: it moved with the camera, see scene.turntable; "
-        "camera: a flash, see scene.flash; auto: the best explanation of colour changes",
+        "world: the light is fixed; turntable: it moves with the camera, see scene.turntable; "
+        "camera: a flash, see scene.flash; auto: whichever explains the colour changes best",
     )
     detail: Detailing = setting(
         "texture", "texture: refine the albedo from full-size photographs after training"
     )
     carving_seconds: float = setting(
         12.0,
-        "most expected time on two cores for carving concavities; skipped if the light varies",
+        "maximum expected time for carving concavities on two cores; skipped if the light varies",
         unit="seconds",
         least=0,
     )
     patience: float = setting(
         0.0,
-        "validation gain in 15 % of a stage, below which the stage is shortened; 0: never",
+        "shorten a stage if validation gains less than this in 15 % of it; 0: never",
         unit="dB",
         least=0,
     )
@@ -221,7 +221,7 @@ class TrainConfig:
             )
         if kinds != sorted(kinds):
             raise ConfigError(
-                f"TrainConfig: a dense stage cannot follow a sparse one, got {', '.join(kinds)}"
+                f"TrainConfig: dense stages must come before sparse ones, got {', '.join(kinds)}"
             )
         if "hash" in kinds and self.scene.channels % PER_LEVEL:
             raise ConfigError(
@@ -236,7 +236,7 @@ class TrainConfig:
             )
         if not self.scene.sky_nodes and any(isinstance(s, JointConfig) for s in self.stages):
             raise ConfigError(
-                "TrainConfig: a JointConfig stage needs scene.sky_nodes above 0, got 0"
+                "TrainConfig: a JointConfig stage needs scene.sky_nodes above 0, but it is 0"
             )
         if self.budget_mb is not None and self.capacity == "fixed":
             raise ConfigError(
@@ -276,7 +276,7 @@ def load_config(path: Path) -> TrainConfig:
     values = read_json(path)
     try:
         if not isinstance(values, dict):
-            raise ConfigError(f"expected an object with the configuration, got {values!r:.60}")
+            raise ConfigError(f"expected a JSON object of settings, got {values!r:.60}")
         values = {name: value for name, value in values.items() if name != "version"}
         if isinstance(values.get("scene"), dict):
             values["scene"] = dict(values["scene"])
@@ -298,7 +298,7 @@ def check_same(cfg: TrainConfig) -> None:
     except (OSError, UserError) as error:
         raise UserError(f"{path}: this run cannot be resumed: {error}") from None
     if not isinstance(before, dict):
-        raise UserError(f"{path}: expected an object with the configuration, got {before!r:.80}")
+        raise UserError(f"{path}: expected a JSON object of settings, got {before!r:.80}")
     began = _completed(before, cfg)
     # of configurations from before there were any
     since = {"downscale": 1, "voxel_pixels": 0.0}

@@ -47,7 +47,7 @@ class EnvMap:
             raise ValueError(
                 "environment map: expected finite radiance of at least 0, got "
                 f"{r[row, column, channel].item()} in row {row}, column {column} and "
-                f"{len(bad) - 1} more"
+                f"{len(bad) - 1} more such values"
             )
         if not math.isfinite(self.rotation):
             raise ValueError(f"environment map: rotation must be finite, got {self.rotation}")
@@ -171,7 +171,7 @@ def read_map(path: Path) -> EnvMap:
     """
     if path.suffix.lower() in SUFFIXES and kind_of(path) not in (".exr", ".hdr"):
         raise DataError(
-            f"{path}: expected an environment map, .hdr or .exr, got an image with 8 or 16 bits, "
+            f"{path}: expected an environment map (.hdr or .exr), got an image with 8 or 16 bits, "
             "which cannot hold the brightness of the sun"
         )
     radiance = read_image(path, infinite=True)

@@ -51,7 +51,7 @@ class StillBackground(DataError):
 
     def __init__(self, seen: str):
         super().__init__(
-            f"{seen}: it seems that the object was turned before a static camera. Make masks of "
+            f"{seen}: it seems that the object was rotated before a static camera. Make masks of "
             "the object and pass them as masks=DIR, so that the background is ignored",
             "masks",
         )

@@ -85,7 +85,7 @@ def load_world(run: Path) -> np.ndarray | None:
     except (KeyError, TypeError, ValueError, OverflowError):
         moved = np.empty(0)
     if moved.shape != (3, 4) or not np.isfinite(moved).all():
-        raise DataError(f"{path}: expected from_data, a rotation and a translation")
+        raise DataError(f"{path}: expected from_data with a rotation and a translation")
     return moved
 
 
@@ -96,7 +96,7 @@ def _source_of(run: Path) -> Source:
         raise DataError(f"{run}: expected the folder of a run, but it has no {path.name}")
     config = read_json(path)
     if not isinstance(config, dict):
-        raise DataError(f"{path}: expected an object with the configuration, got {config!r:.80}")
+        raise DataError(f"{path}: expected a JSON object of settings, got {config!r:.80}")
     # In runs from before there was a choice
     before = {"downscale": 0, "allow_outside": False}
     values = before | config
@@ -107,7 +107,7 @@ def _source_of(run: Path) -> Source:
             # 0 in runs from before a size was chosen for large photographs: those were refused
             return Source(Path(data), downscale or 1, outside)
     raise DataError(
-        f"{path}: expected data, a folder, and downscale, at least 0, got "
+        f"{path}: expected data, the name of a folder, and downscale, at least 0, got "
         f"{values.get('data')!r:.80} and {values.get('downscale')!r:.80}"
     )
 
@@ -211,7 +211,7 @@ def judge(evidence: Evidence) -> Verdict:
         GOOD_RESIDUAL,
         POOR_RESIDUAL,
         "{:.0%} of the surface differs visibly from its photographs",
-        "train with `--preset full`, if masks are right and the object did not move",
+        "train with `--preset full`, if the masks are correct and the object did not move",
     )
     if evidence.troubles:
         times = "once" if evidence.troubles == 1 else f"{evidence.troubles} times"
@@ -222,9 +222,9 @@ def judge(evidence: Evidence) -> Verdict:
     remedies = [remedy for _, _, remedy in faults]
     if evidence.steps:
         word = "unfinished"
-        made = ", ".join(f"{share:.0%} for {name}" for name, share in evidence.steps.items())
+        made = ", ".join(f"{share:.0%} of {name}" for name, share in evidence.steps.items())
         why = "it was stopped" if evidence.stopped else "the time limit was too short"
-        reasons.insert(0, f"{why}: of the planned steps it made {made}")
+        reasons.insert(0, f"{why} (completed steps: {made})")
         needed = None if evidence.minutes is None else math.ceil(evidence.minutes)
         if evidence.stopped or evidence.limit is None:
             remedies.insert(0, "resume the training with `--resume`")

@@ -39,9 +39,9 @@ from univoxel.ops.networks import DirectionTable
 class SceneConfig:
     """Sizes of the model."""
 
-    channels: int = setting(16, "features per voxel", least=1)
+    channels: int = setting(16, "number of features per voxel", least=1)
     material_channels: int = setting(
-        8, "features that albedo and roughness are decoded from", least=1
+        8, "number of features from which albedo and roughness are decoded", least=1
     )
     hidden: int = setting(64, "width of the material and radiance heads", least=1)
     mirror_levels: int = setting(5, "levels of the table of reflected directions", least=0, most=8)
@@ -63,7 +63,7 @@ class SceneConfig:
         most=1,
     )
     turntable: Turntable | None = setting(
-        None, "axes about which the light turns with the camera; None: the light stands still"
+        None, "axes about which the light rotates with the camera; None: the light is fixed"
     )
     flash: float | None = setting(
         None,
@@ -86,14 +86,14 @@ class SceneConfig:
         check_fields(self, most, lambda x: x <= self.channels, "material_channels")
         if self.turntable is not None and not isinstance(self.light, lights.LocalLightConfig):
             raise ConfigError(
-                "SceneConfig: light that turns with the camera needs hybrid or a local lighting "
+                "SceneConfig: light that rotates with the camera needs hybrid or a local lighting "
                 f"model (sg, sh or mlp), got {self.light.kind}",
                 "light_frame",
                 "light",
             )
         if self.turntable is not None and self.varying == "light":
             raise ConfigError(
-                "SceneConfig: light that turns with the camera cannot vary as well; only "
+                "SceneConfig: light that rotates with the camera cannot vary as well; only "
                 "exposure can",
                 "light_frame",
                 "varying",
@@ -378,7 +378,8 @@ class Description:
     def __post_init__(self) -> None:
         check_fields(self, "above 0", lambda x: 0 < x < math.inf, "inv_s")
         if (self.field == "hash") != (self.levels is not None):
-            raise ConfigError(f"Description: only a hash field has levels, got {self.field}")
+            asked = "without" if self.levels else "with"
+            raise ConfigError(f"Description: expected a {self.field} field {asked} levels")
 
 
 def load_checkpoint(run: str | Path) -> tuple[Scene, dict[str, Any]]:
@@ -409,7 +410,7 @@ def load_checkpoint(run: str | Path) -> tuple[Scene, dict[str, Any]]:
         scene.load_state_dict(tensors)
         return scene.eval(), state
     except (RuntimeError, KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        raise DataError(f"{path}: the contents contradict the description: {error}") from error
+        raise DataError(f"{path}: the tensors do not match their description: {error}") from error
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -428,7 +429,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         )
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not tensor.isfinite().all():
-            raise DataError(f"{path}: damaged: NaN or infinity in {name}")
+            raise DataError(f"{path}: damaged: {name} contains NaN or infinity")
     return meta, tensors
 
 
@@ -456,7 +457,7 @@ def _scene(about: Description, bricks: Bricks | None) -> Scene:
     field = Field(distances, encoding)
     if field.channels != about.scene.channels:
         raise ValueError(
-            f"{field.channels} channels in its field, {about.scene.channels} in its networks"
+            f"{field.channels} channels in the field, but {about.scene.channels} in the networks"
         )
     return Scene(about.scene, field, about.inv_s)
 
@@ -479,7 +480,7 @@ def _compare(scene: Scene, tensors: dict[str, Tensor]) -> None:
             came = list(tensors[name].shape)
             raise ValueError(f"expected {name} with shape {list(value.shape)}, got {came}")
         elif tensors[name].is_floating_point() != value.is_floating_point():
-            raise ValueError(f"expected {name} as {value.dtype}, got {tensors[name].dtype}")
+            raise ValueError(f"expected {name} of type {value.dtype}, got {tensors[name].dtype}")
 
 
 def _compare_rows(name: str, table: Tensor, rows: Tensor, values: Tensor) -> None:
@@ -488,8 +489,8 @@ def _compare_rows(name: str, table: Tensor, rows: Tensor, values: Tensor) -> Non
     count = table.numel() // math.prod(channels)
     if rows.dtype != torch.int32 or list(values.shape) != [*rows.shape, *channels]:
         raise ValueError(
-            f"expected {name} as rows with {channels} values, got {list(rows.shape)} "
-            f"{rows.dtype} and {list(values.shape)}"
+            f"expected {name} as int32 rows with {channels} values each, got rows "
+            f"{list(rows.shape)} {rows.dtype} and values {list(values.shape)}"
         )
     if count > ROWS_FOR_ONE * (len(rows) + ROWS_FOR_ONE):
         raise ValueError(f"expected {name} with {count} rows, got at most {len(rows)}")

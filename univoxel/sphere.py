@@ -210,5 +210,5 @@ def gaps(
             f"{names[begin]} and {names[end]}"
         )
     if height.max() < HIGH:
-        told.append(f"no photograph from above {height.max():.0f} degrees")
+        told.append(f"no photograph from more than {height.max():.0f} degrees above the horizon")
     return told

@@ -99,5 +99,5 @@ def test_which_settings_are_trained(passed, tmp_path):
     assert [p["setting"] for p in record["points"]] == ["fast", "lobes-x2"]
     assert record["fronts"]["cup"]["nvs_psnr"] == ["fast"]
     assert {p["minutes"] for p in record["published"]} >= {18, 14, None}
-    with pytest.raises(ValueError, match=r"only must be of draft, fast, full, .*, got speed"):
+    with pytest.raises(ValueError, match=r"only must be among draft, fast, full, .*, got speed"):
         module.chart([tmp_path], out, only=["fast", "speed"])

@@ -77,7 +77,7 @@ def test_settings_follow_from_the_arguments(passed, tmp_path):
 
 
 def test_failures_are_told_after_all_is_written(passed, tmp_path):
-    with pytest.raises(RuntimeError, match=r"1 of 2 trainings failed; .*cup/sh: it broke"):
+    with pytest.raises(RuntimeError, match=r"1 of 2 training runs failed; .*cup/sh: it broke"):
         module.compare([tmp_path], tmp_path / "out", light=["sg", "sh"])
     names = {"compare.md", "compare.json", "compare.png", "compare.svg"}
     assert {p.name for p in (tmp_path / "out").iterdir()} == names

@@ -71,7 +71,7 @@ def test_a_failure_is_recorded_and_the_rest_goes_on(out):
     assert re.match("[A-Za-z]+Error: Overflow", outcome.error)
     assert not outcome.measures
     failed = runner.failures([outcome, load_outcome(out / "ball" / "small")])
-    assert failed.startswith("1 of 2 trainings failed; ")
+    assert failed.startswith("1 of 2 training runs failed; ")
     assert f"ball/dies: {outcome.error}" in failed
 
 
@@ -86,9 +86,7 @@ def test_what_is_done_is_not_done_again(data, out, trained):
 def test_results_of_other_settings_are_not_taken(data, out, trained):
     other = dataclasses.replace(SMALL, changes=(*TINY, "seed=5"))
     for settings, samples in (([other], 1), ([SMALL], 2)):
-        with pytest.raises(
-            ValueError, match=r"small/result\.json: made with another configuration"
-        ):
+        with pytest.raises(ValueError, match=r"small/result\.json: comes from another config"):
             runner.run([data], settings, out, samples=samples)
     assert not trained
 

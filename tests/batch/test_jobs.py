@@ -112,7 +112,7 @@ def test_a_process_that_dies_each_time_is_given_up_and_others_go_on(tmp_path):
         found = {e.name: e for e in run_jobs(client, [dies, counting(tmp_path, "mug")], 2, tries=3)}
     assert found["mug"].state == "done"
     assert found["dies"].state == "failed"
-    assert re.match("ended by SIGKILL.*memory runs out; tries: 3", found["dies"].errors["say"])
+    assert re.match("ended by SIGKILL.*memory runs out; attempts: 3", found["dies"].errors["say"])
     assert (tmp_path / "n").read_text() == "xxx"
 
 
@@ -194,7 +194,7 @@ def test_other_options_are_refused(tmp_path):
     assert run_job(job).state == "done"
     job.check_same()
     other = dataclasses.replace(job, identity={"seed": 2, "steps": 2})
-    with pytest.raises(ExistingFile, match=r"mug\.json has another seed: choose another out"):
+    with pytest.raises(ExistingFile, match=r"mug\.json is of another seed: choose another out"):
         other.check_same()
 
 
@@ -276,7 +276,7 @@ def test_a_scheduler_that_is_gone_is_said_and_its_work_ends(tmp_path):
             running.kill()
 
         threading.Thread(target=kill).start()
-        with pytest.raises(ProcessFailed, match="scheduler was lost: run the same command again"):
+        with pytest.raises(ProcessFailed, match="lost contact with the scheduler: run the same"):
             list(run_jobs(client, [job], 1))
         wait_for(lambda: not alive(begun(tmp_path, "mug")[0]))
     last = counting(tmp_path, "mug", last=int((tmp_path / "mug" / "at").read_text()) + 2)
@@ -291,7 +291,7 @@ def test_a_worker_without_the_package_is_named(tmp_path):
 
     with connect(1) as client, pytest.MonkeyPatch.context() as patch:
         patch.setattr("univoxel.batch.jobs.run_on_worker", run_on_worker)
-        with pytest.raises(ProcessFailed, match="a worker has no univoxel, or another version"):
+        with pytest.raises(ProcessFailed, match="a worker lacks univoxel or has another version"):
             list(run_jobs(client, [counting(tmp_path, "mug")], 1))
 
 
@@ -353,7 +353,7 @@ def test_mistakes_are_named(tmp_path, monkeypatch):
         pass
     monkeypatch.setattr("univoxel.batch.jobs.CONNECT_SECONDS", 0.5)
     with (
-        pytest.raises(ProcessFailed, match=r"scheduler=tcp://127\.0\.0\.1:9: no scheduler of Dask"),
+        pytest.raises(ProcessFailed, match=r"scheduler=tcp://127\.0\.0\.1:9: no Dask scheduler"),
         connect(1, "tcp://127.0.0.1:9"),
     ):
         pass

@@ -119,7 +119,7 @@ def test_the_time_is_told_once_it_is_measured(monkeypatch, caplog):
     assert caplog.messages == ["masks: using the network isnet-general-use, 179 MB"]
     for _ in range(2):
         assert torch.equal(masked(photograph()), photograph()[..., 0] / 255)
-    assert caplog.messages[1:] == ["masks: 5.1 s per photograph, about 5 min for 60"]
+    assert caplog.messages[1:] == ["masks: 5.1 s per photograph, about 5 min for all 60"]
 
 
 def test_rembg_goes_first(home, monkeypatch, caplog):
@@ -140,7 +140,7 @@ def test_rembg_goes_first(home, monkeypatch, caplog):
         raise ConnectionError("no network")
 
     made.new_session = offline
-    with pytest.raises(DataError, match=r"expected u2netp; the download failed: no network"):
+    with pytest.raises(DataError, match=r"could not download the weights of u2netp: no network"):
         module.mask_network()
 
 

@@ -129,10 +129,10 @@ def test_a_shift_alone_counts_as_still():
 def test_reasons_of_photographs_without_a_place():
     features = {1: 0, 2: 900, 3: 900, 4: 900}
     pairs = [(2, 3, 12, 2), (3, 4, 80, 2)]
-    assert why_not(None, features, pairs, {}) == "no features in it that can be matched"
-    assert why_not(1, features, pairs, {}) == "no features in it that can be matched"
+    assert why_not(None, features, pairs, {}) == "no features that can be matched"
+    assert why_not(1, features, pairs, {}) == "no features that can be matched"
     assert why_not(2, features, pairs, {}) == "12 matches with its best partner; 15 are needed"
-    assert why_not(3, features, pairs, {3: 4}).startswith("connected to 4 others")
+    assert why_not(3, features, pairs, {3: 4}).startswith("connected to 4 photographs")
     assert why_not(4, features, pairs, {}) == (
         "80 matches with its best partner, which disagree with the others"
     )

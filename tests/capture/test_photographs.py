@@ -326,7 +326,7 @@ def test_masks_that_do_not_fit_are_refused(tmp_path):
 
 def test_one_photograph_is_too_few(tmp_path):
     quarters().save(tmp_path / "a.jpg")
-    with pytest.raises(DataError, match="at least two photographs, could read 1"):
+    with pytest.raises(DataError, match="at least two photographs, can read 1"):
         gather([tmp_path / "a.jpg"], None)
 
 

@@ -154,7 +154,7 @@ def test_what_is_left_out_is_named(scene):
     assert f"{VIEWS + 1} photographs from 2 cameras (2 zoom settings)" in said[0]
     assert "2 could not be read: broken.jpg, notes.txt" in said[0]
     assert any(f"{VIEWS} of {VIEWS + 1} registered" in line for line in said)
-    assert any("white.jpg (no features in it that can be matched)" in line for line in said)
+    assert any("white.jpg (no features that can be matched)" in line for line in said)
     report = json.loads((out / "poses.json").read_text())
     rows = {row["name"]: row for row in report["photographs"]}
     assert rows["white.jpg"]["written"] == ""
@@ -337,7 +337,7 @@ def test_too_few_placed_is_one_line(photographs, tmp_path):
 def test_what_is_no_folder_of_photographs_is_one_line(tmp_path):
     with pytest.raises(DataError, match="expected a folder of photographs or a video"):
         poses(tmp_path / "none", tmp_path / "out")
-    with pytest.raises(DataError, match="every applies to videos"):
+    with pytest.raises(DataError, match="every is for videos"):
         poses(tmp_path, tmp_path / "out", every=1.0)
     for name in "ab":
         Image.new("RGB", (64, 48)).save(tmp_path / f"{name}.jpg")

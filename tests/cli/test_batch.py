@@ -315,7 +315,7 @@ def test_mistakes_are_found_before_anything_is_begun(scenes, tmp_path, monkeypat
         ("config", tmp_path / "none.json", "got both: .*none.json says them"),
     ):
         refused(UserError, match, options=dataclasses.replace(OPTIONS, **{field: value}))
-    refused(UserError, "expected jobs or scheduler, got both", scheduler="tcp://x:1")
+    refused(UserError, "expected jobs or scheduler, but not both", scheduler="tcp://x:1")
     monkeypatch.setitem(sys.modules, "distributed", None)
     refused(MissingExtra, r"univoxel\[cluster\]")
 

@@ -152,12 +152,12 @@ def test_few_masks_stay_as_they_are(tmp_path, caplog):
     masks = [photos.picture(view)[1] for view in range(4)]
     folder = write_masks(tmp_path / "masks", masks, photos.names)
     task.cutout(data, tmp_path / "cut", folder)
-    assert "that needs 12 photographs, there are 4" in caplog.text
+    assert "that needs 12 photographs and there are only 4" in caplog.text
     masks[1][:] = 0
     write_masks(folder, masks, photos.names)
     with pytest.raises(DataError, match="the mask of r_1 is empty"):
         task.cutout(data, tmp_path / "other", folder)
-    with pytest.raises(DataError, match="the mask of r_0 shows nothing in the box"):
+    with pytest.raises(DataError, match="the mask of r_0 is empty inside the box"):
         task.cutout(data, tmp_path / "other", folder, box=(0, 0, 9, 1, 1, 10))
     (folder / "r_2.png").unlink()
     with pytest.raises(DataError, match=r"got none for 1: r_2\.png"):

@@ -61,18 +61,18 @@ def test_a_build_without_embree(without_embree, capsys):
     assert main(["doctor"]) == 2
     said = capsys.readouterr()
     assert "-> install a wheel that has it" in " ".join(said.out.split())
-    assert said.err.startswith("univoxel doctor: this installation cannot train: Embree: none")
+    assert said.err.startswith("univoxel doctor: this installation cannot train: Embree: missing")
 
 
 def test_no_build_at_all(monkeypatch):
     monkeypatch.setattr(native, "core", None)
-    monkeypatch.setattr(native, "variant", "no extension built under /here")
+    monkeypatch.setattr(native, "variant", "no compiled extension in /here")
     status = native_status()
     assert (status.loaded, status.variant, status.embree) == (False, None, None)
-    assert status.reason == "no extension built under /here"
+    assert status.reason == "no compiled extension in /here"
     finding = doctor.kernels(status)
-    assert (finding.state, finding.found) == ("bad", "not loaded: no extension built under /here")
-    with pytest.raises(MissingNative, match=r"kernels: not loaded: .* Embree: none"):
+    assert (finding.state, finding.found) == ("bad", "not loaded: no compiled extension in /here")
+    with pytest.raises(MissingNative, match=r"kernels: not loaded: .* Embree: missing"):
         doctor.check([finding, doctor.embree(status)])
 
 

@@ -296,7 +296,7 @@ def broken_relit(folders):
             lambda f: (f.data / "envmaps" / "dim.hdr").write_bytes(b"#?"),
             r"dim\.hdr: expected a header",
         ),
-        (broken_truth, "truth of r_1 to have 16x16 pixels as in the test view, got 5x4"),
+        (broken_truth, "truth of r_1 with 16x16 pixels as in the test view, got 5x4"),
         (broken_relit, r"dim/r_0\.png: expected 16x16 pixels as in the test view, got 5x4"),
     ],
 )
@@ -311,7 +311,7 @@ def test_bad_folders(folders, relit_calls, change, message):
     [
         ({"samples": 0}, "expected samples >= 1 and bounces >= 0"),
         ({"bounces": -1}, "expected samples >= 1 and bounces >= 0"),
-        ({"light_of": "r_0", "fit_light": True}, "expected light_of or fit_light, got both"),
+        ({"light_of": "r_0", "fit_light": True}, "expected light_of or fit_light, but not both"),
     ],
 )
 def test_bad_settings(folders, change, message):

@@ -108,8 +108,8 @@ def test_grids_of_a_training_are_no_finer_than_its_photographs(data, tmp_path, m
 @pytest.mark.parametrize(
     ("masks", "wide", "said"),
     [
-        ("auto", True, "masks are 3 pixels too wide: they are taken in\n"),
-        ("given", True, "masks are 3 pixels too wide: see masks=auto\n"),
+        ("auto", True, "masks extend 3 pixels past the object's edge: they are eroded\n"),
+        ("given", True, "masks extend 3 pixels past the object's edge: masks=auto erodes them\n"),
         ("auto", False, None),
     ],
 )
@@ -200,9 +200,7 @@ def test_a_model_of_colmap_in_a_world_of_its_own(tmp_path, caplog):
     data = write_colmap(tmp_path / "data", written, parameters=(focal, 32.0, 32.0))
     stages = (plain_stage(voxels=0.01, iterations=40, share=1.0, rays=256),)
     out = train(config(data, tmp_path / "run", stages=stages, downscale=2))
-    said = (
-        "COLMAP model, 14 photographs of 32x32 pixels in train, downscaled to 1/2, world turned to"
-    )
+    said = "14 photographs of 32x32 pixels in train, downscaled to 1/2, world rotated so"
     assert said in caplog.text
     mesh = extract_mesh(load_scene(out))
     middle = (mesh.vertices.amin(0) + mesh.vertices.amax(0)) / 2
@@ -336,9 +334,7 @@ def test_a_limit_may_be_enough_for_the_steps_alone(caplog):
     cameras = SimpleNamespace(width=4000, height=3000)
     photos = type("", (), {"cameras": cameras, "downscale": 1, "__len__": lambda self: 60})()
     task.announce(progress, photos)
-    assert caplog.messages[-1].endswith(
-        "minutes=2 are enough for all steps if cameras and masks take 30 s"
-    )
+    assert caplog.messages[-1].endswith("for all steps if preparation takes at most 30 s")
     assert clock.preparation == 30.0
 
 
@@ -350,8 +346,8 @@ def test_a_stage_without_a_step_is_said_and_ends_with_code_3(data, tmp_path, mon
     options = ["--out", str(tmp_path / "run"), "--config", str(tmp_path / "config.json")]
     assert main(["train", str(data), *options]) == 3
     said = capsys.readouterr().out
-    assert "the time limit was too short: of the planned steps it made 0% for" in said
-    assert "minutes 0.0001 are enough for about 0% of the steps, --minutes 1 for all" in said
+    assert "the time limit was too short (completed steps: 0% of" in said
+    assert "--minutes 0.0001 is enough for about 0% of the steps; --minutes 1 is enough" in said
     verdict = load_verdict(tmp_path / "run")
     assert verdict.empty
     assert verdict.remedies[0] == "`--minutes 1`"

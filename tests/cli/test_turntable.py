@@ -77,7 +77,7 @@ def test_which_light_it_was(photographs, light, caplog):
         assert found.by_turning_light > 2 * found.by_still_light
         assert found.ahead > 3
         assert told == LightFrame(TURNTABLE)
-        assert "light: it turns with the camera, as on a turntable" in caplog.text
+        assert "light: it rotates with the camera, as on a turntable" in caplog.text
 
 
 def test_exposures_are_no_light(photographs):
@@ -112,7 +112,7 @@ def test_what_decides(photographs, monkeypatch, caplog, still_around, ahead, sav
     assert (found.turntable is not None) == turns
     assert found.flash is None
     if turns:
-        assert "a light that stands still 0 %" in caplog.text
+        assert "a fixed light explains 0 %" in caplog.text
 
 
 def test_what_is_known_is_not_looked_for(photographs):

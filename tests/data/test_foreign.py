@@ -181,7 +181,7 @@ def test_lists_are_read_as_they_were_meant(tmp_path, writer, name, change):
         assert torch.equal(alpha, wanted[color][0])
         torch.testing.assert_close(camera, wanted[color][1:], atol=1e-5, rtol=1e-5)
     about = load_photos(data).about
-    assert ("cameras of 10 scaled to smaller images" in about) == (name == "smaller")
+    assert ("10 cameras scaled to smaller images" in about) == (name == "smaller")
 
 
 def test_pictures_of_one_name_in_two_folders(tmp_path):
@@ -308,4 +308,4 @@ def test_cameras_of_a_rig_are_named(tmp_path):
 
 def test_one_photograph_is_told(tmp_path, caplog):
     load_photos(write_nerfstudio(tmp_path, scene(2), test_filenames=["images/p_000.png"]))
-    assert "one view does not give a shape: at least 3" in caplog.text
+    assert "one photograph is not enough for a shape: at least 3" in caplog.text

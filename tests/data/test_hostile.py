@@ -46,7 +46,7 @@ def moved(place: object):
         (lambda r: [r.pop("fl_x"), r.update(camera_angle_x=1e-320)], "0: expected focal lengths"),
         (lambda r: [r.pop("fl_x"), r.update(camera_angle_x=3.14159265)], "expected focal lengths"),
         (moved(GIANT), "frame 0: expected a finite 4x4 transform_matrix, got"),
-        (moved(1e308), r"frame 0: expected numbers up to 1e\+09, got 1e\+308"),
+        (moved(1e308), r"frame 0: expected matrix values up to 1e\+09, got 1e\+308"),
         (lambda r: r["frames"][0].update(file_path="a\0b"), "expected an object with a file_path"),
         (lambda r: r["frames"][0].update(mask_path="a\0b"), "frame 0: the mask"),
     ],
@@ -88,8 +88,8 @@ def test_places_of_colmap(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (b"[" * 100_000, "too deep a nesting"),
-        (b'{"a":' * 100_000, "too deep a nesting"),
+        (b"[" * 100_000, "nested too deeply"),
+        (b'{"a":' * 100_000, "nested too deeply"),
         (b'{"a": ' + b"1" * 5000 + b"}", "an integer has too many digits"),
         (b"\xff\xfe{}", "expected text in UTF-8"),
         (b"{", "invalid JSON in line 1, column 2"),
@@ -126,7 +126,7 @@ def test_names_come_before_pictures(data, tmp_path, monkeypatch, layout):
         data = write_colmap(tmp_path / "colmap", scene(), text=True)
         path = data / "sparse/0/images.txt"
         path.write_text(path.read_text().replace("p_003.png", "p_004.png"))
-        message = r"images\.txt: expected photographs with unique names, got 'p_004\.png'"
+        message = r"images\.txt: expected unique names of photographs, got another 'p_004\.png'"
     with pytest.raises(DataError, match=message):
         load_photos(data)
 
@@ -211,7 +211,7 @@ def test_names_that_mean_another_folder(data, file_path, file, name):
     """Results are written under the names of views: `relight` wrote OUT.png beside OUT."""
     edit(data / "transforms.json", lambda r: r["frames"][1].update(file_path=file_path))
     (data / "images" / "p_008.png").rename(data / file)
-    message = f"frame 1: expected valid file names, got '{name}'"
+    message = f"frame 1: expected a name that can be a file name, got '{name}'"
     with pytest.raises(DataError, match=message):
         load_photos(data, "test")  # it is the first by name
     with pytest.raises(DataError, match=message):

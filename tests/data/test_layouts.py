@@ -42,7 +42,7 @@ WRITERS = {
     "TensoIR layout (rgba_sunset.png)": write_tensoir,
 }
 REMARKS = {
-    "Polycam raw data": ", world turned from +Y to +Z up",
+    "Polycam raw data": ", world rotated so that +Z is up (was +Y)",
     "Metashape cameras": (
         ", 1 of 11 cameras left out: not placed, not enabled or in another component"
     ),
@@ -85,7 +85,7 @@ def test_a_world_in_any_direction_is_turned_upright(tmp_path, writer):
     turn = Rotation.from_rotvec([2.0, -0.5, 0.7])
     written = scene()
     photos = load_photos(writer(tmp_path, written.turned(turn)))
-    assert photos.about.endswith("world turned to +Z up")
+    assert photos.about.endswith("world rotated so that +Z is up")
     views = written.split("train")
     position = photos.cameras.camera_to_world[:, :, 3]
     wanted = torch.from_numpy(written.poses[views, :3, 3]).float()
@@ -171,7 +171,7 @@ def test_cameras_on_their_side_do_not_say_what_is_up(tmp_path):
     turn[:2, :2] = [[0, -1], [1, 0]]
     lying = written.poses @ turn
     photos = load_photos(write_colmap(tmp_path, type(written)(lying, written.pictures)))
-    assert photos.about.endswith("world not turned upright: its cameras do not show what is up")
+    assert photos.about.endswith("world not rotated: its cameras do not show which direction is up")
     wanted = torch.from_numpy(lying[written.split("train"), :3, 3]).float()
     torch.testing.assert_close(photos.cameras.camera_to_world[:, :, 3], wanted)
 

@@ -56,10 +56,10 @@ def one(row, column, new):
         ),
         (rows(lambda _: np.array({"a": 1})), "npy: this NumPy array could not be read"),
         (rows(lambda r: r[:, :15]), r"npy: expected \[V, 17\] numbers, got \(10, 15\)"),
-        (rows(lambda r: r.astype(str)), r"npy: expected \[V, 17\] numbers, got 10 of <U"),
+        (rows(lambda r: r.astype(str)), r"npy: expected \[V, 17\] numbers, got 10 x <U"),
         (rows(lambda r: r[1:]), "expected a row for each of 10 photographs in .*images, got 9"),
         (one(2, 14, lambda _: 0), "row 2: expected height, width and focal length above 0, got"),
-        (one(3, 4, lambda x: 2 * x), r"p_003.png: expected an image with the shape 12x16 as in"),
+        (one(3, 4, lambda x: 2 * x), r"p_003.png: expected the aspect ratio 12x16 of its"),
         (one(1, 0, lambda x: x + 0.5), "row 1: expected a rigid transform_matrix"),
         (
             lambda f: [path.unlink() for path in (f / "images").iterdir()],

@@ -285,9 +285,9 @@ def test_soft_masks_stay_as_they_are(tmp_path):
 @pytest.mark.parametrize(
     ("picture", "message"),
     [
-        (Image.fromarray(np.array([[0, 1, 2]], np.uint8)), "maximum of 2 of 255"),
-        (palette([[0, 1, 2]], (0, 0, 0), (128, 0, 0), (0, 128, 0)), "a palette with 3 colours"),
-        (palette([[0, 1, 1]], (9, 9, 200), (128, 0, 0)), "a palette with 2 colours"),
+        (Image.fromarray(np.array([[0, 1, 2]], np.uint8)), "values of at most 2 of 255"),
+        (palette([[0, 1, 2]], (0, 0, 0), (128, 0, 0), (0, 128, 0)), "3 colours of a palette"),
+        (palette([[0, 1, 1]], (9, 9, 200), (128, 0, 0)), "2 colours of a palette"),
         (
             Image.fromarray(np.random.default_rng(0).integers(0, 255, (9, 9, 3), np.uint8)),
             "got an image with several colours",
@@ -345,9 +345,9 @@ def lit(tmp_path):
     [
         (np.fliplr, "mirrored left to right"),
         (np.flipud, "mirrored top to bottom"),
-        (lambda mask: np.rot90(mask, 2), "turned by 180 degrees"),
-        (lambda mask: np.rot90(mask, -1), "turned by 90 degrees to the left"),
-        (np.rot90, "turned by 90 degrees to the right"),
+        (lambda mask: np.rot90(mask, 2), "rotated by 180 degrees"),
+        (lambda mask: np.rot90(mask, -1), "rotated by 90 degrees to the left"),
+        (np.rot90, "rotated by 90 degrees to the right"),
         (np.transpose, "mirrored about a diagonal"),
     ],
 )
@@ -385,7 +385,7 @@ def test_faint_masks_are_refused(lit):
     for path in (lit / "masks").iterdir():
         mask = np.asarray(Image.open(path)) // 4
         save(path, mask + np.arange(40) % 20)
-    with pytest.raises(DataError, match=r"expected masks .*, got a maximum of 82 of 255 in 8"):
+    with pytest.raises(DataError, match=r"expected masks .*, got values of at most 82 of 255 in 8"):
         load_photos(lit)
 
 

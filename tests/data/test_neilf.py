@@ -28,7 +28,7 @@ def test_images_that_were_not_placed(tmp_path):
     (tmp_path / "inputs" / "images" / "p_002.png").unlink()
     photos = load_photos(tmp_path)
     assert photos.names == ["p_001", "p_004", "p_006", "p_007", "p_008", "p_009"]
-    assert "because they are missing, 2 without a camera left out" in photos.about
+    assert "missing and left out, 2 photographs without a camera left out" in photos.about
 
 
 def test_names_as_the_readme_has_them(tmp_path):
@@ -56,19 +56,19 @@ def test_names_as_the_readme_has_them(tmp_path):
             edited(lambda r: [i.update(flg=0) for i in r["camera_track_map"]["images"].values()]),
             "sfm_scene.json: expected images with cameras",
         ),
-        (image(lambda i: i.pop("camera")), r"image 3: expected size \[w, h\] and a camera of"),
-        (image(lambda i: i.update(size=[12])), r"image 3: expected size \[w, h\] and a camera of"),
+        (image(lambda i: i.pop("camera")), r"image 3: expected size \[w, h\] and a camera with"),
+        (image(lambda i: i.update(size=[12])), r"image 3: expected size \[w, h\] and a camera"),
         (image(lambda i: i["camera"].update(extrinsic=[1.0] * 15)), "image 3: .* 16 numbers"),
         (
             image(lambda i: i["camera"].update(extrinsic=(2 * np.eye(4)).ravel().tolist())),
-            "image 3: expected the last row 0 0 0 1",
+            "image 3: transform_matrix must end with 0 0 0 1",
         ),
         (
             image(lambda i: i["camera"]["intrinsic"].update(focal=[-1.0, 2.0])),
             "image 3: expected fl_x between 0 and inf, got -1.0",
         ),
         (image(lambda i: i.update(size=[-12, 8])), "image 3: expected w between 0 and inf, got -1"),
-        (image(lambda i: i.update(size=[12, 12])), r"p_003.png: expected an image with the shape"),
+        (image(lambda i: i.update(size=[12, 12])), r"p_003.png: expected the aspect ratio"),
         (lambda f: (f / "inputs" / "images").rename(f / "photos"), "json: missing images: p_000"),
     ],
 )

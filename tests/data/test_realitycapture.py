@@ -47,7 +47,7 @@ def test_pictures_that_are_not_there_and_names_with_folders(tmp_path):
     edited(("p_002.png", r"D:\shots\p_002.tif"))(tmp_path)
     photos = load_photos(tmp_path)
     assert photos.names[0] == "p_002"
-    assert "1 of 10 listed images left out" in photos.about
+    assert "1 of 10 listed images are missing" in photos.about
 
 
 def value(index, new):

@@ -166,7 +166,7 @@ def test_up_is_that_of_photographs_as_they_are_looked_at(tmp_path, written):
         replace(s, pose=whole.poses[v, :3], image=tmp_path / "none") for v, s in enumerate(shots)
     ]
     (found, said), (wanted, _) = upright(shots), upright(level)
-    assert said == ["world turned to +Z up"]
+    assert said == ["world rotated so that +Z is up"]
     for one, other in zip(found, wanted, strict=True):
         np.testing.assert_allclose(one.pose[:, 3], other.pose[:, 3], atol=1e-6)
 

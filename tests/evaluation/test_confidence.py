@@ -179,7 +179,7 @@ def test_words_leave_out_what_is_not_the_case(surveyed):
     still = replace(surveyed, disagreement=agreeing, views=views)
     figures = numbers(still)
     said = words(figures, [])
-    assert said.startswith("Uncertainty of the albedo 0.")
+    assert said.startswith("Mean uncertainty over the surface: 0.")
     assert "cameras" not in said
     assert "differs" not in said
     assert "Photographs cannot separate the brightness" in said

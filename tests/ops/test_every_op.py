@@ -194,21 +194,21 @@ REFUSED = {
     ],
     "sample_sparse": [
         *PLACE,
-        ({"bricks": None}, "bricks must be Bricks, got NoneType"),
+        ({"bricks": None}, "bricks must be of the type Bricks, got NoneType"),
         (
             {"bricks": EMPTY, "sdf": torch.rand(256), "features": torch.rand(256, 2)},
             r"bricks must have nodes, got size \[0, 4, 4\]",
         ),
     ],
     "encode_hash": [
-        ({"table": torch.rand(63, 2)}, "power of two rows for each of 2 levels"),
-        ({"table": torch.rand(24, 2)}, "power of two rows .* got 24 in all"),
-        ({"table": torch.rand(0, 2)}, "power of two rows .* got 0 in all"),
+        ({"table": torch.rand(63, 2)}, "a power of two for each of 2 levels"),
+        ({"table": torch.rand(24, 2)}, "a power of two .* got 24 in all"),
+        ({"table": torch.rand(0, 2)}, "a power of two .* got 0 in all"),
         ({"lower": (0.0, 1.0)}, "lower must be 3 finite numbers"),
         ({"upper": (0.0, 1.0, NAN)}, "upper must be 3 finite numbers"),
         ({"lower": (9.0, 0.0, 0.0)}, "lower must be at most upper"),
-        ({"voxel_sizes": ()}, "voxel_sizes must be numbers above 0, at least one"),
-        ({"voxel_sizes": (0.5, 0.0)}, "voxel_sizes must be numbers above 0"),
+        ({"voxel_sizes": ()}, "voxel_sizes must be one or more numbers above 0"),
+        ({"voxel_sizes": (0.5, 0.0)}, "voxel_sizes must be one or more numbers above 0"),
         ({"felt": -1}, "felt must be at least 0, got -1"),
     ],
     "composite_field": [
@@ -217,7 +217,7 @@ REFUSED = {
         ({"min_share": 1.0}, r"min_share must be in \[0, 1\), got 1.0"),
         ({"voxel_size": -1.0}, "voxel_size must be above 0"),
         ({"levels": LEVELS}, r"features must be \[T, F\]"),
-        ({"levels": LEVELS, "features": torch.rand(6, 2)}, "power of two rows"),
+        ({"levels": LEVELS, "features": torch.rand(6, 2)}, "a power of two"),
     ],
     "march": [
         ({"brick_min": torch.zeros(4, 3, 3)}, "brick_min does not belong to this sdf"),
@@ -255,11 +255,11 @@ REFUSED = {
         *(({"max_sharpness": x}, "max_sharpness must be above 0") for x in (0.0, INF)),
     ],
     "mlp": [
-        ({"biases": [torch.rand(8)]}, "one for each of the layers.* got 2 and 1"),
-        ({"weights": [], "biases": []}, "at least one, got 0 and 0"),
+        ({"biases": [torch.rand(8)]}, "one of biases for each .* got 2 weights and 1 biases"),
+        ({"weights": [], "biases": []}, "got 0 weights and 0 biases"),
         (
             {"x": torch.rand(5, 0), "weights": [torch.rand(2, 0)], "biases": [torch.rand(2)]},
-            "every size must be at least 1, got H0=0",
+            "every layer must be at least 1 wide, got H0=0",
         ),
     ],
     "patch_correlation": [
@@ -273,15 +273,15 @@ REFUSED = {
     ],
     "match_cost": [
         *(({"best": x}, rf"best must lie in \[1, 4\], got {x}") for x in (0, 5)),
-        ({"steps": 0}, "steps must be at least 1 and radius at least 0, got 0 and 1"),
-        ({"radius": -1}, "got 7 and -1"),
+        ({"steps": 0}, "steps >= 1 and radius >= 0, got steps=0 and radius=1"),
+        ({"radius": -1}, "got steps=7 and radius=-1"),
         ({"others": torch.tensor([1, 2, 3, 5])}, r"others must lie in \[0, 5\)"),
-        ({"rows": torch.zeros(2, 6, dtype=torch.int64)}, "rows must name each of the"),
+        ({"rows": torch.zeros(2, 6, dtype=torch.int64)}, "rows must contain each of the"),
     ],
     "semi_global": [
-        ({"small": 0.2, "large": 0.1}, "0 <= small <= large, got 0.2 and 0.1"),
+        ({"small": 0.2, "large": 0.1}, "0 <= small <= large must hold, got 0.2 and 0.1"),
         ({"small": -0.1}, "got -0.1 and 0.2"),
-        ({"rows": torch.full((2, 6), -1)}, "rows must name each of the"),
+        ({"rows": torch.full((2, 6), -1)}, "rows must contain each of the"),
     ],
     "smooth_rows_": [
         *(({"rows": torch.tensor([x])}, r"rows must lie in \[0, 180\)")
@@ -302,7 +302,7 @@ REFUSED = {
         ),
         ({"amount": 1.5}, "amount must be in"),
         ({"passes": -1}, "passes must be at least 0"),
-        ({"size": (2, 2)}, "size must be that of the grid"),
+        ({"size": (2, 2)}, "size must be the size"),
         ({"values": torch.ones(354)[::2]}, "they must be contiguous"),
     ],
     "adam_rows_": [
@@ -318,10 +318,10 @@ REFUSED = {
     ],
     "sum_rows": [
         ({"rows": [], "values": []}, "at least one"),
-        ({"rows": [torch.tensor([1, 2])]}, "as many lists"),
+        ({"rows": [torch.tensor([1, 2])]}, "equally many rows and values"),
         *(({"rows": [torch.tensor(x)], "values": [torch.ones(2, 3)]}, "rows must ascend in")
           for x in ([5, 5], [5, 4], [-1, 3], [3, 12])),
-        *(({"shape": x}, "shape must be sizes of at least 1") for x in ((), (4, 0))),
+        *(({"shape": x}, "every size in shape must be at least 1") for x in ((), (4, 0))),
     ],
 }  # fmt: skip
 if RAYS:

@@ -130,7 +130,7 @@ def test_diffusion_refuses_what_does_not_fit_its_memory_or_its_bricks():
     _, _, bricks = cut(torch.linspace(-1, 1, 512).view(8, 8, 8), far=1.0)
     with pytest.raises(ValueError, match="they must be contiguous"):
         diffuse_rows_(torch.ones(4)[::2], torch.tensor([0, 1]), (2, 2, 2), 0.5, 1)
-    with pytest.raises(ValueError, match="size must be that of the grid"):
+    with pytest.raises(ValueError, match="size must be the size"):
         diffuse_rows_(one, rows, (8, 8, 9), 0.5, 1, bricks)
     spare = torch.cat([bricks.place, bricks.place.new_full((1,), -1)])
     wider = dataclasses.replace(bricks, place=spare)

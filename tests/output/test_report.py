@@ -130,8 +130,8 @@ def test_photographs_stand_beside_their_render_the_worst_first(run, text):
 
 
 def test_doubt_is_painted_and_told(text):
-    said = section(text, "Doubt")
-    assert "Uncertainty of the albedo 0." in said
+    said = section(text, "Uncertainty")
+    assert "Mean uncertainty over the surface: 0." in said
     names = [name for name, _ in pictures(said)]
     assert names == ["front", "right", "back", "left"]
 
@@ -214,8 +214,8 @@ def test_what_time_cut_is_told(tmp_path):
     assert report.stage_ends(state) == pytest.approx([17.0, 37.0])
     told = report.remarks(cfg, state)
     assert told[0] == "Training has not ended: it is in stage 4."
-    assert "of the planned steps it made 40% for shape" in told[1]
-    assert "recovered 1 times, last in a." in told[2]
+    assert "(completed steps: 40% of shape)" in told[1]
+    assert "trouble 1 times, the last in a." in told[2]
     assert report.stage_ends({}) == []
     assert report.prepared({}) is None
 
@@ -267,7 +267,7 @@ def test_a_run_whose_photographs_are_gone_shows_what_is_left(run, data, tmp_path
         report_text(moved, scene, state, ReportOptions(data=tmp_path / "gone"))
     (moved / "config.json").write_text("{")
     text = report_text(moved, scene, state, ReportOptions(size=SIZE))
-    assert "config.json could not be read" in text
+    assert "no table of stages" in text
 
 
 def test_metal_is_a_layer_where_there_is_any(tmp_path):

@@ -163,7 +163,7 @@ def test_a_mask_that_lacks_a_part_is_outvoted_and_cameras_stay(photos, caplog):
     with caplog.at_level("INFO"):
         found = choose_masks_or_poses(spoilt, distance, "auto", "auto")
     assert (found.refined, found.votes) == (False, 2)
-    assert "the masks are taken to be rough" in caplog.text
+    assert "the masks are assumed to be rough" in caplog.text
     assert found.box[1][2] > 0.9 * RADIUS  # nothing is bitten off
 
 

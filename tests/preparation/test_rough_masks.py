@@ -94,7 +94,7 @@ def test_of_plain_objects_silhouettes_alone_tell_masks_from_cameras(photos, capl
         found = choose_masks_or_poses(spoilt, distance, "auto", "auto")
     assert not found.refined
     assert found.votes > 1
-    assert "pose refinement does not help: the masks are taken to be rough" in caplog.text
+    assert "pose refinement does not help: the masks are assumed to be rough" in caplog.text
     # What is told is believed
     assert choose_masks_or_poses(spoilt, distance, "refined", "auto").refined
     assert choose_masks_or_poses(spoilt, distance, "auto", "given").refined
@@ -111,7 +111,7 @@ def test_jagged_edges_are_not_doubted():
 
 def test_silhouettes_in_which_nothing_lies(photos, tmp_path):
     cfg = preset("fast", tmp_path / "data", tmp_path / "run")
-    with pytest.raises(DataError, match=r"data: .*(have no common volume|nothing in common)"):
+    with pytest.raises(DataError, match=r"data: .*(have no common volume|overlap in no part)"):
         prepare.find_silhouettes(replace(photos, alpha=torch.zeros_like(photos.alpha)), cfg)
 
 

@@ -156,7 +156,7 @@ def test_samples_of_no_area():
 
 @pytest.mark.parametrize("function", [metrics.psnr, metrics.ssim])
 def test_sizes_must_agree(function):
-    with pytest.raises(ValueError, match=r"sizes to agree, got \[4, 4, 3\] and \[5, 5, 3\]"):
+    with pytest.raises(ValueError, match=r"equal sizes, got \[4, 4, 3\] and \[5, 5, 3\]"):
         function(gray(0, 4), gray(0, 5))
 
 
@@ -169,5 +169,5 @@ def test_rank_correlation():
     assert with_ties == pytest.approx(3 / 22.5**0.5)
     assert metrics.spearman(x, torch.ones(4)) is None
     assert metrics.spearman(torch.empty(0), torch.empty(0)) is None
-    with pytest.raises(ValueError, match="spearman: expected sizes to agree"):
+    with pytest.raises(ValueError, match="spearman: expected equal sizes"):
         metrics.spearman(x, x[:2])

@@ -156,7 +156,7 @@ def test_what_was_cut_is_told(tmp_path, clock):
     assert progress.state()["made"] == progress.clock.made
     assert progress.clock.pace == progress.clock.made[1]
     assert progress.clock.short() == {"shape": progress.clock.made[1]}
-    cut = "the time limit ended the training early: of the planned steps it made 50% for shape"
+    cut = "the time limit ended the training early (completed steps: 50% of shape)"
     assert progress.clock.cut() == cut
     assert progress.clock.minutes_for_all() == pytest.approx((1 + 2 * 55) / 60, abs=0.05)
 
@@ -215,7 +215,7 @@ def test_a_training_that_is_stopped_hurries_through_what_is_left(tmp_path, clock
             spent = clock.now - begin - 16
             assert spent == pytest.approx((0.17 + 0.415 * k) * left, abs=3)
     assert progress.clock.over
-    told = "the training was stopped early: of the planned steps it made 3% for coarse shape"
+    told = "the training was stopped early (completed steps: 3% of coarse shape"
     assert progress.clock.cut().startswith(told)
     assert progress.state()["finished"]
     assert Progress(cfg, clock.now, progress.state()).clock.finished

@@ -150,8 +150,8 @@ def test_a_training_is_ended_from_a_browser(data, tmp_path, looking, caplog):
     assert state["made"][0] < 0.5
     assert state["made"][1:] == [1.0, 1.0]
     assert len(scene.field.isosurface()[0]) > 100
-    assert "Uncertainty of the albedo" in (run / "trust.txt").read_text()
-    assert "Result: unfinished, it was stopped: of the planned steps it made" in caplog.text
+    assert "Mean uncertainty over the surface" in (run / "trust.txt").read_text()
+    assert "Result: unfinished, it was stopped (completed steps:" in caplog.text
 
 
 def test_light_that_varies_and_cameras_that_move(data, tmp_path, looking, monkeypatch):
@@ -178,7 +178,7 @@ def test_the_port_is_taken_which_is_said_before_anything(tmp_path, capfd):
         for option in (["--port", str(port)], ["--host", "0.0.0.0"]):
             assert main([*arguments, *option]) == 2
             said = capfd.readouterr().err
-            assert said == f"univoxel train: {' '.join(option)} needs --view\n"
+            assert said == f"univoxel train: {' '.join(option)} has no effect without --view\n"
 
 
 def test_by_the_command_line(data, tmp_path, capfd, monkeypatch):

@@ -96,7 +96,7 @@ class Job:
         before = self.record()["identity"]
         other = [key for key, value in self.identity.items() if before and before.get(key) != value]
         if other:
-            where = f"{self.name}: {self.file('.json')} has another {' and '.join(other)}"
+            where = f"{self.name}: {self.file('.json')} is of another {' and '.join(other)}"
             hint = "choose another out, or remove that file and the folder of its results"
             raise ExistingFile(f"{where}: {hint}", "out")
 
@@ -141,7 +141,7 @@ def _steps(job: Job, watch: Callable[[Step], None]) -> tuple[Any, dict[str, str]
         code, said = _run(job, step, watch)
         seconds[step.name] = seconds.get(step.name, 0.0) + time.monotonic() - begin
         if (cause := system.ended_by(code)) is not None:
-            errors[step.name] = f"ended by {cause}; the system does that if memory runs out"
+            errors[step.name] = f"ended by {cause}; the system does this when memory runs out"
         elif code:
             errors[step.name] = said or f"ended with exit code {code}"
         elif step.makes is not None and not step.makes.exists():
@@ -221,7 +221,7 @@ def connect(jobs: int, scheduler: str | None = None) -> Iterator[Client]:
         try:
             client = stack.enter_context(Client(scheduler, timeout=CONNECT_SECONDS))
         except (OSError, ValueError, TypeError) as error:
-            said = f"no scheduler of Dask answers there: {' '.join(str(error).split()):.200}"
+            said = f"no Dask scheduler answers at this address: {' '.join(str(error).split()):.200}"
             raise ProcessFailed(f"scheduler={scheduler}: {said}", "scheduler") from None
 
         def version() -> str:  # in here, so that it goes there by value: its module may lack there
@@ -281,7 +281,7 @@ def run_jobs(client: Client, jobs: Sequence[Job], total: int, tries: int = 3) ->
                 result = _result(future, job)
                 deaths[job.name] += result.state == "killed"
                 if deaths[job.name] >= tries:
-                    errors = {s: f"{said}; tries: {tries}" for s, said in result.errors.items()}
+                    errors = {s: f"{said}; attempts: {tries}" for s, said in result.errors.items()}
                     result = replace(result, state="failed", errors=errors)
                 table.ended(result)
                 if result.state in ("killed", "locked"):
@@ -315,13 +315,13 @@ def _result(future: Any, job: Job) -> Result:
     from distributed import KilledWorker
 
     if future.status in ("lost", "cancelled"):
-        raise ProcessFailed("the scheduler was lost: run the same command again to resume")
+        raise ProcessFailed("lost contact with the scheduler: run the same command again to resume")
     error = future.exception()
     if error is None:
         return future.result()
     if isinstance(error, KilledWorker):
         return Result(job.name, "failed", {"worker": "every worker that took this scene died"})
-    raise ProcessFailed(f"a worker has no univoxel, or another version of it: {error}") from error
+    raise ProcessFailed(f"a worker lacks univoxel or has another version of it: {error}") from error
 
 
 class ProgressTable:

@@ -51,7 +51,7 @@ def named(scenes: Sequence[Path]) -> dict[str, Path]:
             raise UserError(f"expected scene folders with different names, got {both}")
         found[name] = path
     if not found:
-        raise UserError("expected at least one scene, a folder of photographs, got none")
+        raise UserError("expected at least one scene (a folder of photographs), got none")
     return found
 
 

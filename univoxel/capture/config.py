@@ -23,16 +23,16 @@ class CaptureConfig:
     first_octave: int = setting(
         -1,
         "first octave of the scale space: -1 doubles the image first; 0 takes a quarter of the "
-        "time and loses photographs of smooth objects",
+        "time but may lose photographs of smooth objects",
         least=-1,
     )
     seed: int = setting(0, "random seed", least=0)
     exhaustive: int = setting(
         24,
-        "photographs up to which all pairs are matched; beyond, a coarse comparison selects them",
+        "up to this number of photographs, all pairs are matched; beyond, only similar ones",
         least=2,
     )
-    partners: int = setting(16, "pairs per photograph that are matched in full", least=1)
+    partners: int = setting(16, "number of similar photographs to match with each one", least=1)
 
     __post_init__ = check_settings
 

@@ -219,8 +219,8 @@ def check_masks(origin: str, network: str, box: Sequence[float] | None, keep_tab
     check_network(network)
     if network != NETWORK and origin not in (REMBG, "auto"):
         raise UserError(
-            f"network={network} is used only if masks are made: expected masks from {REMBG}, got "
-            f"{origin}",
+            f"network={network} has no effect unless a network makes the masks: expected masks "
+            f"from {REMBG}, got {origin}",
             "network",
         )
     if box is not None:
@@ -240,13 +240,13 @@ def _from_depth(
     """Masks of what stands out in depth."""
     small = masks_by_depth(maps, box, keep_table)
     if small is None and box is not None:
-        raise object_shape.nothing_inside(box, "depth covers no surface", maps.cameras)
+        raise object_shape.nothing_inside(box, "depth was found for no surface", maps.cameras)
     shape = None if small is None else object_shape.find_object(small, maps, FINE, box)
     if shape is None or shape.surface < GUESSED:
         raise DataError(
             f"{splits['train'].folder}: depth separates no object from its surroundings. Depth "
-            f"needs texture, and cameras all around the object: use source={REMBG} or a folder "
-            f"of masks instead of {DEPTH}",
+            f"needs texture and cameras all around the object; otherwise, use source={REMBG} or a "
+            f"folder of masks instead of {DEPTH}",
             "source",
         )
     _tell_evidence(shape, 0, box)
@@ -271,12 +271,12 @@ def _within(splits: dict[str, Photos], masks: Masks, box: Tensor) -> Masks:
 def _tell_evidence(shape: object_shape.ObjectShape, count: int, box: Tensor | None) -> None:
     """Log what the object was told by, masks of so many photographs among it, and where it is."""
     by = [f"masks of {count} photographs"] if count else []
-    by += [f"depth of {shape.surface:.0%} of the surface"]
+    by += [f"depth on {shape.surface:.0%} of its surface"]
     by += [] if box is None else ["the box"]
     lower, upper = (
         object_shape.words_of(corner.tolist()) for corner in object_shape.inside_bounds(shape)
     )
-    log.info(f"the object was found by {', '.join(by)}; it spans {lower} to {upper}")
+    log.info(f"the object was found by {', '.join(by)}; it extends from {lower} to {upper}")
 
 
 def _silhouettes_of(shape: object_shape.ObjectShape, photos: Photos) -> list[Tensor]:
@@ -327,7 +327,7 @@ def _judged(
                     where = "" if box is None else " inside the box"
                     raise DataError(f"{split.folder}: the mask of {stem} is empty{where}")
         log.warning(
-            "masks are not checked: that needs %d photographs, there are %d",
+            "masks are not checked, because that needs %d photographs and there are only %d",
             *(PHOTOGRAPHS, count),
         )
         return _as_they_are(masks), "too few photographs to check the masks: they are unchanged"
@@ -359,7 +359,7 @@ def _judged(
     if 2 * wrong > count and shape.surface < SURE:
         told += ": none is corrected, because the shape may be wrong instead"
         log.warning(
-            f"{told}. Either all masks make the same error or the cameras are wrong: check "
+            f"{told}. Either all masks have the same fault or the cameras are wrong: check "
             "masks.html"
         )
         for name, those in verdicts.items():
@@ -382,7 +382,7 @@ def _told(splits: dict[str, Photos], verdicts: dict[str, list[Verdict]], usual: 
             if verdict.fault:
                 faults[verdict.fault].append(stem)
     wrong = sum(map(len, faults.values()))
-    told = f"masks: {count - wrong} of {count} agree with the object's silhouette ({usual:.2f})"
+    told = f"masks: {count - wrong} of {count} agree with the object's silhouette (IoU {usual:.2f})"
     if not wrong:
         return told
     parts = []

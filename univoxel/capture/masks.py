@@ -82,7 +82,7 @@ def mask_network(name: NetworkName = NETWORK) -> Callable[[Tensor], Tensor]:
     try:
         session = rembg.new_session(name)
     except OSError as error:  # requests' errors are some
-        raise DataError(f"{weights}: expected {name}; the download failed: {error}") from None
+        raise DataError(f"{weights}: could not download the weights of {name}: {error}") from None
 
     def masked(photograph: Tensor) -> Tensor:
         mask = session.predict(Image.fromarray(photograph.numpy()))[0]
@@ -142,7 +142,7 @@ def timed(
         if first:
             first, seconds = False, monotonic() - begun
             whole = duration(count * seconds)
-            log.info("masks: %.1f s per photograph, about %s for %d", seconds, whole, count)
+            log.info("masks: %.1f s per photograph, about %s for all %d", seconds, whole, count)
         return mask
 
     return measured

@@ -168,7 +168,7 @@ def weak(
     if not points:
         return {}
     least = max(WEAK_POINTS, WEAK_SHARE * float(np.median(list(points.values()))))
-    few = {n: f"only {count} points" for n, count in points.items() if count < least}
+    few = {n: f"only {count} matched points" for n, count in points.items() if count < least}
     against = {}
     for number, those in partners.items():
         share, matches = _fitting(those)
@@ -210,9 +210,9 @@ def why_not(
         elsewhere: of pictures that other models hold, the size of theirs.
     """
     if number is None or not features.get(number):
-        return "no features in it that can be matched"
+        return "no features that can be matched"
     if number in elsewhere:
-        return f"connected to {elsewhere[number]} others, but not to the rest"
+        return f"connected to {elsewhere[number]} photographs, but not to the rest"
     best = max((n for a, b, n, _ in pairs if number in (a, b)), default=0)
     if best < NEEDED:
         return f"{best} matches with its best partner; {NEEDED} are needed"

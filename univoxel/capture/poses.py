@@ -184,7 +184,7 @@ def photographs_of(
         return sorted(folders.frames.glob("*.jpg")), [], 0
     if every is not None:
         raise DataError(
-            f"{source}: every applies to videos only ({' '.join(photographs.SUFFIXES)})", "every"
+            f"{source}: every is for videos only ({' '.join(photographs.SUFFIXES)})", "every"
         )
     if not source.is_dir():
         raise DataError(f"{source}: expected a folder of photographs or a video")
@@ -241,7 +241,7 @@ def _search(
             unreadable[index] = why
     if unreadable:
         names = [capture.photographs[i].path.name for i in unreadable]
-        log.warning(f"{len(names)} could not be read: {_some(names)}")
+        log.warning(f"{len(names)} photographs could not be read: {_some(names)}")
 
     def do(step: str, part: Callable[..., Iterator[int]], total: int) -> None:
         if not steps.done(folders.work, step, settings):
@@ -256,7 +256,7 @@ def _search(
         stands = f"the background is static in {still} of {matching} pairs"
         if capture.masks is None:
             raise StillBackground(stands)
-        raise DataError(f"{stands}: the masks include part of it, so make them tighter", "masks")
+        raise DataError(f"{stands}, and the masks include part of it: make them tighter", "masks")
     do(MODELS, structure.place, total)
     return unreadable
 
@@ -321,7 +321,7 @@ def _say(capture: Capture, found: Found, total: int, keep_weak: bool) -> None:
     cameras = "one camera" if len(lenses) == 1 else f"{len(lenses)} cameras"
     log.info(
         f"cameras: {len(model.images)} of {total} registered, mean reprojection error "
-        f"{model.error:.2f}, focal length {', '.join(shares)} of the longer side ({cameras})"
+        f"{model.error:.2f} pixels, focal length {', '.join(shares)} x width ({cameras})"
     )
     missing = [f"{r.name} ({r.reason})" for r in reports if not r.placed]
     if missing:
@@ -335,14 +335,14 @@ def _say(capture: Capture, found: Found, total: int, keep_weak: bool) -> None:
     if weak:
         fate = "kept" if keep_weak else "left out (keep_weak keeps them)"
         log.warning(
-            f"{len(weak)} may be off by degrees, {fate}: {_some(weak)}; photograph that side "
-            "again with more overlap",
+            f"the poses of {len(weak)} may be wrong by degrees, {fate}: {_some(weak)}; photograph "
+            "that side again with more overlap",
             extra={"arguments": ("keep_weak",)},
         )
 
 
 def _aside(unread: list[str], doubles: int) -> str:
-    told = f"; {doubles} exist in two formats, one is used" if doubles else ""
+    told = f"; {doubles} exist in two formats, of which one is used" if doubles else ""
     return told + (f"; {len(unread)} could not be read: {_some(unread)}" if unread else "")
 
 

@@ -110,11 +110,11 @@ def _difference(before: Sequence[tuple[str, int]], now: Sequence[tuple[str, int]
     old, new = dict(before), dict(now)
     for name in sorted(old.keys() | new.keys()):
         if name not in old:
-            return f"{name} was not part of it"
+            return f"{name} is new"
         if name not in new:
-            return f"{name} is missing now"
+            return f"{name} is missing"
         if old[name] != new[name]:
-            return f"{name} has changed since"
+            return f"{name} has changed"
     return "their order has changed"
 
 

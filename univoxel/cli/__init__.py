@@ -104,8 +104,8 @@ def laboratory() -> dict[str, Command]:
     """Commands of the experiments by name; a MissingExtra if there is none beside the package."""
     if not has_laboratory():
         raise MissingExtra(
-            f"{', '.join(LABORATORY)} are experiments, which the installed package lacks: clone "
-            "the repository, run `make dev` there, and use .venv/bin/univoxel lab"
+            f"{', '.join(LABORATORY)} run experiments, which are not in the installed package: "
+            "clone the repository, run `make dev` there, and use .venv/bin/univoxel lab"
         )
     return importlib.import_module("lab.commands").COMMANDS
 
@@ -328,7 +328,7 @@ def _kept(call: Call) -> str:
     """What an interrupted command left behind."""
     out = call.run.keywords.get("out")
     if call.name in ("batch", "lab compare", "lab chart", "lab stress"):
-        return f"; finished trainings are in {out}: run the same command again to resume"
+        return f"; finished runs are in {out}: run the same command again to resume"
     if call.name in ("capture", "poses"):
         return f"; finished steps are in {out}: run the same command again to resume"
     if call.name != "train" or not isinstance(out, Path):

@@ -36,11 +36,11 @@ class BatchOptions:
     )
     """steps per scene, in this order: poses masks train eval export page"""
     masks: Annotated[str, parsing.written("auto|rembg|FOLDER|none")] = "auto"
-    """source of the masks for the step masks, as in capture"""
+    """how the step masks makes them, as in capture"""
     preset: choices.PresetOrAuto = "auto"
-    """amount of work, from draft to best; auto: what fits --minutes, else fast"""
+    """amount of work, from draft to best; auto: chosen to fit --minutes, else fast"""
     light: Annotated[choices.LightName, parsing.ADVANCED] = "hybrid"
-    """lighting model; hybrid separates shadows best, the others are for comparison"""
+    """lighting model; hybrid best keeps shadows out of the albedo, others are to compare"""
     minutes: parsing.Minutes = None
     """time limit of each training"""
     config: parsing.ConfigFile = None
@@ -50,13 +50,13 @@ class BatchOptions:
     samples: Annotated[int, parsing.ADVANCED] = choices.SAMPLES
     """light samples per pixel of relit test images"""
     jobs: Annotated[int | None, parsing.written("N", "as cores and memory allow")] = None
-    """scenes at once; each gets --threads threads, or its share of the cores"""
+    """number of scenes at a time; each uses --threads threads, or its share of the cores"""
     scheduler: parsing.Scheduler = None
     """Dask scheduler to use; anyone who can reach it can run code on its workers"""
     tries: Annotated[int, parsing.ADVANCED] = 3
-    """attempts per scene, if its process is killed"""
+    """number of attempts at a scene whose process is killed"""
     json: parsing.JsonFile = None
-    """also write the contents of batch.json here; - prints them, not the table"""
+    """also write the contents of batch.json to a file; - prints them, not the table"""
 
     def training(self) -> TrainConfig:
         """The configuration of a training; a UserError if there is none of that kind."""
@@ -69,7 +69,7 @@ class BatchOptions:
             return changed(config, self.changes)
         if (self.preset, self.light) != ("auto", "hybrid"):
             raise UserError(
-                f"expected config or preset and light, got both: {self.config} sets them", "config"
+                f"config cannot be combined with preset or light: {self.config} sets both", "config"
             )
         config = load_config(self.config)
         minutes = config.minutes if self.minutes is None else self.minutes
@@ -142,9 +142,9 @@ def batch(asked: BatchOptions, threads: int | None = None) -> list[SceneResult]:
     if asked.scheduler is None:
         here = (machine.cores(), machine.memory())
         jobs, threads = share(known.values(), config, *here, jobs, threads)
-        log.info("%d scenes at once, %d threads each", jobs, threads)
+        log.info("%d scenes at a time, %d threads each", jobs, threads)
     elif jobs is not None:
-        raise UserError("expected jobs or scheduler, got both", "jobs", "scheduler")
+        raise UserError("expected jobs or scheduler, but not both", "jobs", "scheduler")
     every = [job_of(name, data, asked, threads) for name, data in known.items()]
     for job in every:
         job.check_same()

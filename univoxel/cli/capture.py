@@ -46,21 +46,21 @@ class CaptureOptions:
     masks: Annotated[str, written("auto|rembg|FOLDER|none")] = AUTO
     """source of the masks; auto: masks in PHOTOS, else a network, else depth only"""
     network: Annotated[choices.NetworkName, ADVANCED] = choices.NETWORK
-    """network that makes the masks; later ones are larger, slower and finer"""
+    """network that makes the masks; later ones are larger, slower and more accurate"""
     box: BoxOf = None
     """corners of a box around the object, in the world of scene/"""
     keep_table: Annotated[bool, ADVANCED] = False
     """keep the table inside the box; needs --masks none"""
     preset: choices.PresetOrAuto = "auto"
-    """amount of work, from draft to best; auto: what fits --minutes, else fast"""
+    """amount of work, from draft to best; auto: chosen to fit --minutes, else fast"""
     light: Annotated[choices.LightName, ADVANCED] = "hybrid"
-    """lighting model; hybrid separates shadows best, the others are for comparison"""
+    """lighting model; hybrid best keeps shadows out of the albedo, others are to compare"""
     minutes: Minutes = None
-    """time limit of the training; cameras and masks come on top"""
+    """time limit of the training; finding cameras and making masks takes extra time"""
     changes: Changes = ()
     """change one configuration field, such as loss.radiance=0.5; repeatable"""
     until: choices.Until = "page"
-    """last step; cameras and masks end before training and print the folder"""
+    """last step to run; cameras and masks stop before training and print the folder"""
 
     @property
     def fingerprint(self) -> Any:
@@ -171,7 +171,7 @@ def capture(
     asked = CaptureOptions(Path(photographs), Path(out), **options)
     if asked.until != "page":
         raise UserError(
-            f"until: expected page, got {asked.until}: call `find_data`",
+            f"until must be page, got {asked.until}: to stop earlier, call `find_data`",
             "until",
         )
     given, project = look_at(asked.photographs), Project(asked.out)
@@ -190,7 +190,7 @@ def capture(
         if not (project.run / FILE).exists():
             seconds = slowdown(training) * sum(map(expected_seconds, training.stages))
             said = f"the training takes about {duration(seconds)} on this machine"
-            log.info(f"{said}; cameras and masks come on top")
+            log.info(f"{said}, in addition to the time for cameras and masks")
         scene = _find_cameras(project, given, asked, config)
         data = _find_masks(project, scene, asked)
         run = _train(replace(training, data=data.absolute(), out=project.run), on_progress)
@@ -218,7 +218,7 @@ def find_data(
     asked = CaptureOptions(Path(photographs), Path(out), **options)
     given, project = look_at(asked.photographs), Project(asked.out)
     if given.kind == "run":
-        raise UserError(f"{given.path} is a trained run with cameras and masks", "until")
+        raise UserError(f"{given.path} is a trained run, which has cameras and masks", "until")
     _check_machine(given, asked)
     begin(project, given)
     _check_network(project, asked)
@@ -231,7 +231,7 @@ def _say(step: str, what: str) -> None:
 
 
 def _skip(step: str, what: Path) -> None:
-    _say(step, f"kept from before, {what}")
+    _say(step, f"already done, see {what}")
 
 
 def _check_unused(given: Given, asked: CaptureOptions, training: TrainConfig) -> None:
@@ -275,7 +275,7 @@ def _check_network(project: Project, asked: CaptureOptions) -> None:
 
     def other(before: str) -> ExistingFile:
         return ExistingFile(
-            f"{project.out} holds cameras found with network={before}: choose another out",
+            f"{project.out} holds cameras found with masks of network={before}: choose another out",
             *("network", "out"),
         )
 
@@ -332,7 +332,7 @@ def _masks_before_cameras(project: Project, given: Given, asked: CaptureOptions)
     if masks == choices.DEPTH:
         raise UserError(
             f"{given.path}: the background is static, as on a turntable, so finding cameras needs "
-            f"masks: expected masks={choices.REMBG} or a folder, got {masks}",
+            f"masks: expected masks={choices.REMBG} or a folder of masks, got {masks}",
             "masks",
         )
     _say("masks", "from a network, for each photograph")
@@ -370,8 +370,7 @@ def _find_masks(project: Project, scene: Path, asked: CaptureOptions) -> Path:
         made = {k: " ".join(map(str, v)) if k == "box" else v for k, v in made.items()}
         words = ", ".join(f"{name}={value}" for name, value in made.items())
         return ExistingFile(
-            f"{project.cut} holds photographs with {words}: to make them again, remove it and "
-            f"{project.run}",
+            f"{project.cut} was made with {words}: to make it again, remove it and {project.run}",
             *made,
         )
 
@@ -383,8 +382,8 @@ def _find_masks(project: Project, scene: Path, asked: CaptureOptions) -> Path:
     if masks == AUTO and not turned and _have_masks(project, scene):
         if asked.box is not None:
             raise UserError(
-                f"{scene} has masks, which training uses unchanged: with a box, expected "
-                f"masks={choices.REMBG}, {choices.DEPTH} or a folder of masks, got {masks}",
+                f"{scene} has masks already, so box would have no effect. To make new masks inside "
+                f"the box, pass masks={choices.REMBG}, masks={choices.DEPTH} or a folder of masks",
                 "masks",
             )
         _skip("masks", scene)
@@ -450,7 +449,7 @@ def _train(wanted: TrainConfig, on_progress: Callable[[TrainingProgress], None] 
     _skip("training", run)
     newest = max((p.stat().st_mtime_ns for p in data.rglob("*.png")), default=0)
     if newest > (run / FILE).stat().st_mtime_ns:
-        log.warning(f"photographs in {data} have changed: to train again, remove {run}")
+        log.warning(f"{data} has changed since training: to train again, remove {run}")
     return run
 
 
@@ -466,8 +465,8 @@ def _check_trained(wanted: TrainConfig, done: bool) -> None:
         same = False
     if not same:
         raise ExistingFile(
-            f"{wanted.out} was trained with another preset, minutes, light or set: to train "
-            "again, remove it, or choose another out",
+            f"{wanted.out} was trained with other values of preset, minutes, light or set: remove "
+            "it to train again, or choose another out",
             *("preset", "minutes", "light", "set", "out"),
         )
 
@@ -522,8 +521,8 @@ def _write_page(project: Project, given: Given, run: Path) -> None:
 
     beside = [
         ("the mesh with materials", project.mesh),
-        ("images with their layers", project.pictures),
-        ("the masks, worst first", project.cut / "masks.html"),
+        ("rendered images with their layers", project.pictures),
+        ("the masks, with the worst first", project.cut / "masks.html"),
     ]
     named = [
         f"{what} ({path.relative_to(project.out).as_posix()})"

@@ -17,15 +17,15 @@ class CutoutOptions:
     out: Annotated[Path, written("DIR")]
     """folder to write to"""
     source: Annotated[str, written("rembg|FOLDER|none", "rembg", name="from")] = "rembg"
-    """source of the masks: a network (rembg), a folder, or none: depth only"""
+    """source of the masks: rembg (a network), none (depth only), or a folder of masks"""
     network: NetworkName = NETWORK
-    """network that makes the masks; later ones are larger, slower and finer"""
+    """network that makes the masks; later ones are larger, slower and more accurate"""
     box: BoxOf = None
     """corners of a box around the object, in the world of the written cameras"""
     keep_table: bool = False
     """keep the table inside the box; needs --from none"""
     downscale: DownscaleBy = "auto"
-    """write photographs at 1/N of their size; auto: no more pixels than grids can use"""
+    """write photographs at 1/N of their size; auto: no finer than the grids can use"""
     allow_outside: bool = False
     """also read files outside the folder if the data set refers to them"""
 

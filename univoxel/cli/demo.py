@@ -33,7 +33,7 @@ class DemoOptions:
 
 @takes(DemoOptions)
 def command(asked: DemoOptions) -> Path:
-    """Train, evaluate and relight the bundled scene, in minutes.
+    """Train, evaluate and relight the bundled scene in a few minutes.
 
     Raises:
         OSError: `out` cannot be written.

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 State: TypeAlias = Literal["good", "look", "bad"]  # bad: training is refused
 COLORS: dict[State, str] = {"good": "green", "look": "yellow", "bad": "red"}
 REINSTALL = "pip install --force-reinstall --no-deps --only-binary univoxel univoxel"
-REBUILD = f"install a wheel with it ({REINSTALL}), or build again with a compiler, GLM and Embree"
+REBUILD = f"install a wheel that has it ({REINSTALL}), or rebuild with a compiler, GLM and Embree"
 DEVELOPERS = {"bench", "dev", "docs", "wheel"}  # extras that no command asks for
 ENOUGH = 4 << 30  # bytes: presets on 100 photographs of about 1000 pixels stay below
 
@@ -43,7 +43,7 @@ class Finding:
 @dataclass(frozen=True)
 class DoctorOptions:
     json: JsonFile = None
-    """write the findings to a file; - prints them, not the table"""
+    """write the findings to a file as JSON; - prints them, not the table"""
 
 
 @takes(DoctorOptions)
@@ -89,7 +89,7 @@ def kernels(status: NativeStatus) -> Finding:
     """Whether the compiled extension is loaded, and the best build of it."""
     if status.variant is None:
         return Finding("kernels", f"not loaded: {status.reason}", "bad", REBUILD)
-    found = f"{status.variant}, out of {' '.join(status.built)}"
+    found = f"{status.variant}, chosen from {' '.join(status.built)}"
     if status.variant == status.usable[-1]:
         return Finding("kernels", found)
     faster = f"this processor supports {status.usable[-1]}, but there is no build for it: {REBUILD}"
@@ -113,7 +113,7 @@ def openmp(runtimes: Sequence[str]) -> Finding:
     found = ", ".join(runtimes) or "none"
     if len(runtimes) <= 1:
         return Finding("OpenMP", found)
-    remedy = "two slow each other down: import univoxel before the package that loads the second"
+    remedy = "several slow each other down: import univoxel before packages that load another"
     return Finding("OpenMP", found, "look", remedy)
 
 
@@ -149,8 +149,8 @@ def extra_findings() -> list[Finding]:
     for name, missing in known.items():
         finding = Finding(f"extra {name}", "installed")
         if missing:
-            remedy = f'if a command needs it: pip install "univoxel[{name}]"'
-            finding = Finding(finding.what, f"without {', '.join(missing)}", "look", remedy)
+            remedy = f'if you need this extra: pip install "univoxel[{name}]"'
+            finding = Finding(finding.what, f"not installed: {', '.join(missing)}", "look", remedy)
         found.append(finding)
     return found
 

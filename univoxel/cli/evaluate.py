@@ -34,11 +34,11 @@ class EvaluateOptions:
     save: Annotated[parsing.File | None, parsing.written("DIR", "none are written")] = None
     """folder to write the rendered images to"""
     json: parsing.JsonFile = None
-    """write the metrics to a file; - prints them, not the table"""
+    """write the metrics to a file as JSON; - prints them, not the table"""
     samples: int = SAMPLES
     """light samples per pixel of relit images"""
     bounces: Annotated[int, parsing.ADVANCED] = BOUNCES
-    """light bounces between parts of the object in relit images"""
+    """number of reflections between parts of the object in relit images"""
     light_of: parsing.LightOf = None
     """training view whose light to render in, by name or number; see train --varying"""
     test_every: Annotated[int | None, parsing.written("N", "the test split", advanced=True)] = None
@@ -49,18 +49,18 @@ class EvaluateOptions:
     """fit the light to each test photograph before measuring, as many papers do"""
 
     full_size: bool = False
-    """also measure novel views at the photographs' full size, with the run's detail"""
+    """also measure novel views at full size, with the texture that train or detail added"""
 
     def __post_init__(self) -> None:
         if self.samples < 1 or self.bounces < 0:
             raise UserError(
                 "evaluate: expected samples >= 1 and bounces >= 0, got "
-                f"{self.samples} and {self.bounces}",
+                f"samples={self.samples} and bounces={self.bounces}",
                 "samples",
                 "bounces",
             )
         if self.fit_light and self.light_of is not None:
-            raise UserError("expected light_of or fit_light, got both", "light_of", "fit_light")
+            raise UserError("expected light_of or fit_light, but not both", "light_of", "fit_light")
 
 
 @parsing.takes(EvaluateOptions)
@@ -178,7 +178,7 @@ def _at_full_size(
     try:
         train = photos_of(run, data, "train")
     except (UserError, OSError) as error:  # views are the model's only
-        log.info("full size: novel views without photographs: %s", error)
+        log.info("full size: novel views use only the model, not the photographs: %s", error)
         train = None
     return dict(measure_full_size(scene, run, photos, train, save))
 

@@ -38,14 +38,14 @@ class ExportOptions:
     """folder of a trained run"""
     mesh: Annotated[File, written("FILE.glb|usdz|obj|ply")]
     """mesh file to write; .glb, .usdz and .obj have textures, .ply vertex colours"""
-    faces: Annotated[int | None, written("N", "20000 with textures, all without")] = None
+    faces: Annotated[int | None, written("N", "20000 with textures, else no limit")] = None
     """maximum number of triangles, at least 4"""
     texture_size: Annotated[
-        int | None, written("TEXELS", "from the photographs, 1024 without detail")
+        int | None, written("TEXELS", "that of the run's detail, else 1024")
     ] = None
     """width of the square textures, a power of 2 up to 4096"""
     watertight: bool = False
-    """close all holes, or fail"""
+    """close all holes; an error if that is impossible"""
     texture_format: Annotated[choices.TextureFormat, ADVANCED] = "png"
     """png is lossless, jpeg is smaller"""
     quality: Annotated[int, written("1-95", advanced=True)] = choices.TEXTURE_QUALITY
@@ -53,7 +53,7 @@ class ExportOptions:
     size: Annotated[float | None, written("METRES", "as photographed")] = None
     """length of the object's longest side"""
     origin: Annotated[choices.Origin, ADVANCED] = "upright"
-    """origin: the data set's, with +Z up or as its files have it; floor or centre"""
+    """what to place at the origin; world: as in the data set; upright: the same, +Z up"""
     lods: Annotated[int, written("N", advanced=True)] = 0
     """also write N coarser levels, each with a quarter of the triangles"""
 
@@ -92,8 +92,8 @@ def require_levels(faces: int, lods: int) -> None:
     coarsest = faces // FEWER**lods
     if coarsest < LEAST_FACES:
         raise UserError(
-            f"export: lods={lods} with {faces} faces leaves {coarsest} in the coarsest level, "
-            f"expected at least {LEAST_FACES}",
+            f"export: lods={lods} with {faces} faces leaves {coarsest} faces in the coarsest "
+            f"level, expected at least {LEAST_FACES}",
             "lods",
         )
 
@@ -112,7 +112,7 @@ def export(asked: ExportOptions) -> list[Path]:
 
     Raises:
         UserError: the run cannot be used, an argument is out of range, there is
-            no surface, or none that can be closed.
+            no surface, or it cannot be closed.
         MissingExtra: .usdz without usd-core.
         OSError: a file cannot be written.
     """

@@ -50,9 +50,9 @@ class InfoOptions:
     run: Run
     """folder of a trained run"""
     json: JsonFile = None
-    """write the numbers to a file; - prints them, not the tables"""
+    """write the numbers to a file as JSON; - prints them, not the tables"""
     picture: Annotated[File | None, written("FILE.png", "none")] = None
-    """draw where the grid stores features, and the size of each part"""
+    """image to write: where the grid stores features, and the size of each part"""
 
 
 @takes(InfoOptions)
@@ -106,7 +106,7 @@ def info(asked: InfoOptions) -> dict[str, Any]:
     found["bytes"] = (run / FILE).stat().st_size
     found["cameras"] = camera_check(scene, run)
     verdict = load_verdict(run)
-    unknown = "Result: unfinished, training has not ended. To improve it: use --resume"
+    unknown = "Result: unfinished, because training has not ended. To finish it, use --resume"
     if (run / "trust.txt").exists():
         unknown = "Result: unknown, because a version before 0.3 trained the run"
     found["said"] = unknown if verdict is None else verdict.sentence()
@@ -133,7 +133,7 @@ def camera_check(scene: Scene, run: Path) -> dict[str, Any] | None:
         photos = photos_of(run, split="train")
         used = scene.registered(photos).cameras
     except UserError as error:
-        log.info("cameras were not checked: %s", error)
+        log.info("the epipolar error is unknown: %s", error)
         return None
     matches = find_matches(photos, mask_distances(photos.coverage(), photos.cameras))
     given, after = (agreement(cameras, matches) for cameras in (photos.cameras, used))

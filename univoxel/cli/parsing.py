@@ -81,9 +81,9 @@ Changes: TypeAlias = Annotated[
 Minutes: TypeAlias = Annotated[float | None, written("MINUTES", "none")]
 ConfigFile: TypeAlias = Annotated[Path | None, written("FILE", "from --preset", advanced=True)]
 JsonFile: TypeAlias = Annotated[File | None, written("FILE|-", "none")]
-LightOf: TypeAlias = Annotated[str | None, written("VIEW", "the mean of all", advanced=True)]
+LightOf: TypeAlias = Annotated[str | None, written("VIEW", "the mean of all views", advanced=True)]
 
-DataOf: TypeAlias = Annotated[File | None, written("DATA", "the data trained on")]
+DataOf: TypeAlias = Annotated[File | None, written("DATA", "the folder trained on")]
 Title: TypeAlias = Annotated[str | None, written("TEXT", "the folder's name")]
 BoxOf: TypeAlias = Annotated[Box | None, written("X0 Y0 Z0 X1 Y1 Z1", "none", advanced=True)]
 DownscaleBy: TypeAlias = Annotated[Downscale, written("auto|N")]
@@ -100,7 +100,7 @@ class Common:
     quiet: bool = False
     """print only results, warnings and errors"""
     verbose: bool = False
-    """print details, elapsed seconds, and the origin of an error"""
+    """print details, elapsed seconds, and the traceback of an error"""
     threads: Annotated[int | None, written("N", "one per core")] = None
     """number of threads"""
 

@@ -20,7 +20,7 @@ class PosesOptions:
     masks: Annotated[Path | None, written("DIR", "the whole images")] = None
     """folder of masks; only pixels inside them count, as a turntable requires"""
     every: Annotated[float | None, written("SECONDS", "80 frames in all")] = None
-    """take the sharpest frame of a video in each period of SECONDS"""
+    """from each period of this length in a video, take the sharpest frame"""
     keep_size: Annotated[int, written("PIXELS", advanced=True)] = KEEP_SIZE
     """maximum longer side of the photographs to write; 0: original size"""
     keep_weak: Annotated[bool, ADVANCED] = False
@@ -30,7 +30,7 @@ class PosesOptions:
     features: Annotated[int | None, written("N", "4096; with --fast: 2048", advanced=True)] = None
     """maximum number of features per photograph"""
     fast: bool = False
-    """four times faster with fewer features; may lose views of smooth objects"""
+    """find features four times faster, but fewer; may lose views of smooth objects"""
     seed: Annotated[int, ADVANCED] = 0
     """random seed"""
 

@@ -62,11 +62,11 @@ class RelightOptions:
     elevation: Annotated[float, written("DEGREES", advanced=True)] = ELEVATION
     """elevation of an orbit above the horizon"""
     turn: Annotated[int | None, written("FRAMES", advanced=True)] = None
-    """keep the first camera and turn the light once in this number of frames"""
-    resolution: Annotated[int | None, written("PIXELS", "the data's; orbits: 512")] = None
+    """keep the first camera and rotate the light once in this number of frames"""
+    resolution: Annotated[int | None, written("PIXELS", "as photographed; orbits: 512")] = None
     """width of the images"""
     rotate: Annotated[float, written("DEGREES", advanced=True)] = 0.0
-    """turn maps and suns counter-clockwise about +Z"""
+    """rotate maps and suns counter-clockwise about +Z"""
     exposure: Annotated[float, written("FACTOR", advanced=True)] = 1.0
     """multiply all light by this factor"""
     samples: int = SAMPLES
@@ -74,7 +74,7 @@ class RelightOptions:
     noise: Annotated[float | None, written("SHARE", advanced=True)] = None
     """in place of --samples: add samples until the relative noise is below SHARE"""
     bounces: Annotated[int, ADVANCED] = BOUNCES
-    """light bounces between parts of the object"""
+    """number of reflections between parts of the object"""
     background: Background = "transparent"
     """background of the images"""
 
@@ -138,7 +138,7 @@ def command(asked: Relight) -> Path:
     options = {field.name: getattr(asked, field.name) for field in fields(RelightOptions)}
     if asked.orbit is not None:
         if asked.cameras != "test":
-            raise UserError(f"expected --orbit or --cameras, got {asked.orbit} and {asked.cameras}")
+            raise UserError("expected --orbit or --cameras, but not both")
         options["cameras"] = f"orbit {asked.orbit}"
     if out is None:
         out = run / "relight" / envmap[0].stem if len(envmap) == 1 else run / "relight"

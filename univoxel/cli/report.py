@@ -20,7 +20,7 @@ class ReportOptions:
     data: DataOf = None
     """folder of the photographs, if they were moved"""
     views: Annotated[int, written("N")] = 4
-    """number of photographs to compare with their render, worst first"""
+    """number of photographs to show beside their render, the worst first"""
     title: Title = None
     """heading of the page"""
 

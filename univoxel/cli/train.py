@@ -28,33 +28,33 @@ class TrainOptions:
     out: Annotated[parsing.File, parsing.written("RUN")]
     """folder to write the run to"""
     preset: choices.PresetOrAuto = "auto"
-    """amount of work, from draft to best; auto: what fits --minutes, else fast"""
+    """amount of work, from draft to best; auto: chosen to fit --minutes, else fast"""
     light: Annotated[choices.LightName, parsing.ADVANCED] = "hybrid"
-    """lighting model; hybrid separates shadows best, the others are for comparison"""
+    """lighting model; hybrid best keeps shadows out of the albedo, others are to compare"""
     varying: Annotated[choices.Differing, parsing.ADVANCED] = "auto"
-    """what changes between photographs; auto: exposure, if it is seen to change"""
+    """what changes between photographs; auto: exposure, if a change is detected"""
     light_frame: Annotated[choices.LightFrameOrAuto, parsing.ADVANCED] = "auto"
-    """world: the light stood still; turntable: moved with the camera; camera: a flash"""
+    """world: the light is fixed; turntable: it moves with the camera; camera: a flash"""
     metal: Annotated[choices.Metal, parsing.ADVANCED] = "auto"
     """all: the object is entirely metal, with patina; some: it is not; auto: detect"""
     detail: choices.DetailingOrAuto = "auto"
-    """texture: refine the albedo from full-size photographs; auto: except for draft"""
+    """texture: refine the albedo from full-size photographs; auto: all but draft do"""
     masks: choices.MasksFrom = "auto"
-    """auto: erode masks that extend past the object's edge; given: leave unchanged"""
+    """auto: erode masks that extend past the object's edge; given: use them unchanged"""
     cameras: choices.CamerasFrom = "auto"
     """refined: optimise camera poses; auto: only if silhouettes are inconsistent"""
     field: Annotated[choices.FieldName, parsing.ADVANCED] = "hash"
     """storage of features: a hash table, every grid node, or bricks at the surface"""
     capacity: Annotated[choices.CapacityOrAuto, parsing.ADVANCED] = "auto"
-    """adaptive: shrink the model as validation allows; auto: if field and light can"""
+    """adaptive: shrink the model as validation allows; auto: if field and light permit"""
     budget_mb: Annotated[float | None, parsing.written("MB", "no limit", advanced=True)] = None
     """maximum size of the model file in megabytes; implies --capacity adaptive"""
     config: parsing.ConfigFile = None
     """reuse the config.json of another run in place of --preset, --light and others"""
     minutes: parsing.Minutes = None
-    """time limit, including preparation; every stage is shortened alike to fit"""
+    """time limit, including preparation; all stages are shortened by the same share"""
     downscale: parsing.DownscaleBy = "auto"
-    """train at 1/N of the photographs' size; auto: no more pixels than grids can use"""
+    """train at 1/N of the photographs' size; auto: no finer than the grids can use"""
     allow_outside: Annotated[bool, parsing.ADVANCED] = False
     """also read files outside the folder if the data set refers to them"""
     seed: Annotated[int | None, parsing.written("N", "0, or from --config", advanced=True)] = None
@@ -101,7 +101,7 @@ class TrainOptions:
 
         for field in fields(TrainOptions):
             if field.name not in OWN and (value := getattr(self, field.name)) != field.default:
-                both = f"expected config or {field.name}={value}, got both: {file} sets it"
+                both = f"{field.name}={value} cannot be combined with config: {file} sets it"
                 raise UserError(both, "config", field.name)
         config = replace(load_config(file), data=Path(self.data), out=Path(self.out))
         return config if self.minutes is None else replace(config, minutes=self.minutes)
@@ -116,7 +116,7 @@ class Train(TrainOptions):
     ] = None
     """record a test view during training, as an animation or a folder of frames"""
     view: bool = False
-    """watch the training in a browser; you can end it early there"""
+    """watch the training in a browser, where you can also end it early"""
     host: Annotated[str | None, parsing.written("ADDRESS", "127.0.0.1", advanced=True)] = None
     """address for --view to listen on"""
     port: Annotated[int | None, parsing.written("N", "8080", advanced=True)] = None
@@ -131,7 +131,7 @@ class Train(TrainOptions):
             return "127.0.0.1" if host is None else host, 8080 if port is None else port
         if host is not None or port is not None:
             option = f"--host {host}" if host is not None else f"--port {port}"
-            raise UserError(f"{option} needs --view")
+            raise UserError(f"{option} has no effect without --view")
         return None
 
 

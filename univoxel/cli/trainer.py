@@ -256,7 +256,7 @@ def announce(progress: Progress, photos: Photos) -> None:
     if fits < 1:
         said += f"for about {fits:.0%} of the steps"
     else:
-        said += f"for all steps if cameras and masks take {duration(clock.preparation)}"
+        said += f"for all steps if preparation takes at most {duration(clock.preparation)}"
     if fits < LEAST:
         said += f"; minutes={math.ceil(whole / 60)} is enough for all of them"
     log.info(said, extra={"arguments": ("minutes",)})

@@ -89,7 +89,7 @@ def read_json(path: Path) -> Any:
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: expected text in UTF-8, got {error.reason}") from None
     except RecursionError:
-        raise DataError(f"{path}: expected JSON, got too deep a nesting") from None
+        raise DataError(f"{path}: this JSON is nested too deeply") from None
     except ValueError:  # Python converts no integers of more than 4300 digits
         raise DataError(f"{path}: expected JSON, but an integer has too many digits") from None
 
@@ -152,7 +152,7 @@ def _read(folder: Path) -> dict[str, Any]:
     path = folder / FILE
     found = read_json(path) if path.exists() else {}
     if not isinstance(found, dict):
-        raise DataError(f"{path}: expected an object of steps, got {type(found).__name__}")
+        raise DataError(f"{path}: expected a JSON object of steps, got {type(found).__name__}")
     return found
 
 

@@ -82,7 +82,7 @@ class Bricks:
         fits = fits and int((self.place >= 0).sum()) == len(stored)
         if not fits or not bool((self.place[number] == stored).all()):
             raise ValueError(
-                f"Bricks: table must hold each of {n} bricks where place says, and 0 or 1 elsewhere"
+                f"Bricks: table must hold each of {n} bricks at its place, and 0 or 1 elsewhere"
             )
 
     def corners(self, brick: Tensor) -> Tensor:

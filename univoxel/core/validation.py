@@ -168,7 +168,7 @@ def record(kind: type[T], values: object) -> T:
     """
     name = kind.__name__
     if not isinstance(values, dict):
-        raise ConfigError(f"{name}: expected an object, got {values!r:.60}")
+        raise ConfigError(f"{name}: expected a JSON object, got {values!r:.60}")
     values = EARLIER.get(name, {}) | without_retired(kind, values)
     hints, known = _hints(kind), {f.name: f for f in _fields(kind) if f.init}
     if unknown := values.keys() - known.keys():
@@ -258,7 +258,7 @@ def _replaced(node: Any, path: list[str], text: str) -> Any:
     name, *rest = path
     known = [str(i) for i in range(len(node))] if isinstance(node, tuple) else _field_names(node)
     if name not in known:
-        raise ConfigError(f"no field {name!r}, there are: {', '.join(known) or 'none'}")
+        raise ConfigError(f"no field {name!r}; the fields are: {', '.join(known) or 'none'}")
     if isinstance(node, tuple):
         i = int(name)
         return (*node[:i], _replaced(node[i], rest, text), *node[i + 1 :])

@@ -74,7 +74,7 @@ def list_colmap(folder: Path, split: str) -> Listed:
     for image in images:  # all of them, before a picture is opened
         if image.name in names or not image.name or "\0" in image.name:
             raise DataError(
-                f"{images_file}: expected photographs with unique names, got {image.name!r}"
+                f"{images_file}: expected unique names of photographs, got another {image.name!r}"
             )
         names.add(image.name)
     shots, missing, scaled = [], [], 0
@@ -99,7 +99,7 @@ def list_colmap(folder: Path, split: str) -> Listed:
         shots.append(Shot(name, str(images_file), path, None, image.pose, lens))
     note = f" (looked in {folder / 'images'} and {folder})"
     lost = left_out(str(images_file), missing, len(images), note)
-    lost += [f"cameras of {scaled} scaled to smaller images"] if scaled else []
+    lost += [f"{scaled} cameras scaled to smaller images"] if scaled else []
     if len(models) > 1:
         lost = [f"{model.relative_to(folder)}, the largest of {len(models)} models", *lost]
     return turned_up(folder, split, "COLMAP model", shots, lost, listed_split)
@@ -130,7 +130,7 @@ def read_cameras(path: Path) -> dict[int, Lens]:
                 radial, tangential = (p[4], p[5], p[8] if p[8:] else 0.0), (p[6], p[7])
                 lens = Lens(width, height, (p[0], p[1]), (p[2], p[3]), radial, tangential)
         if min(width, height) <= 0 or not np.isfinite(p).all():
-            raise ValueError(f"camera {number} has size {width}x{height} and parameters {p}")
+            raise ValueError(f"camera {number} has invalid size {width}x{height} or values {p}")
         lenses[number] = checked(lens)
     return lenses
 
@@ -147,7 +147,7 @@ def read_images(path: Path) -> list[Registered]:
         largest = max(map(abs, quaternion))
         length = np.linalg.norm(quaternion) if largest < 2 else largest
         if not 0.5 < length < 2 or not np.abs(translation).max() <= FARTHEST:
-            raise ValueError(f"the pose of {name} is {quaternion}, {translation}")
+            raise ValueError(f"the pose of {name} is invalid: {quaternion}, {translation}")
         w, x, y, z = np.asarray(quaternion) / length
         cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         to_camera = np.eye(3) + 2 * w * cross + 2 * cross @ cross
@@ -212,7 +212,7 @@ def _cameras_text(path: Path) -> Iterator[tuple[int, str, int, int, list[float]]
             continue
         number, model, width, height, *rest = line.split()
         if len(rest) != _parameters(path, int(number), model):
-            raise ValueError(f"camera {number} has {len(rest)} parameters")
+            raise ValueError(f"camera {number} has the wrong number of parameters, {len(rest)}")
         yield int(number), model, int(width), int(height), [float(value) for value in rest]
 
 

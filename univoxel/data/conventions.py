@@ -68,7 +68,7 @@ def check_skew(skew: float, lens: Lens, where: str) -> None:
     lean = abs(skew) * lens.height / 2 / lens.focal[1]
     if not lean <= SKEW:
         raise DataError(
-            f"{where}: expected pixels with perpendicular axes, got axes that are skewed by "
+            f"{where}: expected rows and columns of pixels to be perpendicular, got a skew of "
             f"{lean:.3g} pixels (skew {skew:.4g})"
         )
 

@@ -181,7 +181,7 @@ def _old_run_lengths(path: Path, body: bytes, height: int, width: int) -> np.nda
     count = np.where(runs, pixels[:, 3].astype(np.int64) << power, 1)
     if len(body) % 4 or not len(last) or last[0] < 0 or count.sum() != height * width:
         raise DataError(
-            f"{path}: expected {4 * height * width} bytes of {width}x{height} flat pixels or "
+            f"{path}: expected {width}x{height} pixels, as {4 * height * width} flat bytes or "
             f"run-length encoded rows, got {len(body)} bytes"
         )
     return np.repeat(pixels[last], count, 0).reshape(height, width, 4)
@@ -341,11 +341,11 @@ def _read_exr(path: Path) -> tuple[dict[str, np.ndarray], Sequence[float]]:
         raise DataError(f"{path}: this OpenEXR file could not be read: {error}") from None
     if len(colored) > 1:
         raise DataError(
-            f"{path}: expected one image, got several parts with colours: {names}: write the "
-            "part you want into its own file"
+            f"{path}: expected one image, got several parts with colours ({names}): write the "
+            "part you want to its own file"
         )
     if len({pixels.shape for pixels in channels.values()}) != 1:
-        raise DataError(f"{path}: expected channels of one size, got subsampled ones")
+        raise DataError(f"{path}: expected channels of one size, got subsampled channels")
     if not np.array_equal(data, shown):
         channels = {name: _framed(p, data, shown, path) for name, p in channels.items()}
     return {name: np.asarray(pixels, np.float32) for name, pixels in channels.items()}, stated
@@ -357,7 +357,7 @@ def _framed(
     """Pixels of a data window in those of the display window."""
     width, height = (int(high - low) + 1 for low, high in zip(*shown, strict=True))
     if min(width, height) < 1 or width * height > MOST_FRAMED:
-        raise DataError(f"{path}: expected a display window of pixels, got {width}x{height}")
+        raise DataError(f"{path}: expected a valid display window, got {width}x{height} pixels")
     framed = np.zeros((height, width), pixels.dtype)
     x, y = (int(d - s) for d, s in zip(data[0], shown[0], strict=True))
     into = framed[max(y, 0) : max(y + pixels.shape[0], 0), max(x, 0) : max(x + pixels.shape[1], 0)]
@@ -525,7 +525,7 @@ def as_array(image: Image.Image, path: Path, in_srgb: bool = False) -> np.ndarra
     if image.mode.startswith("I;16"):
         return np.asarray(image, np.float32)[..., None] / 65535
     if image.mode in ("I", "F"):
-        raise DataError(f"{path}: expected an image of 8 or 16 bits, got 32: convert it")
+        raise DataError(f"{path}: expected an image with 8 or 16 bits, got 32 bits: convert it")
     grey = image.mode in ("1", "L")
     mode = "L" if grey else "RGBA" if image.has_transparency_data else "RGB"
     source = image
@@ -618,7 +618,7 @@ def is_heif(path: Path) -> bool:
 def _what_it_is(path: Path, error: Exception) -> str:
     """Why a file could not be read: it may be of another kind than its name says."""
     if is_heif(path):
-        return "it is in fact HEIC or AVIF: convert it to JPEG, as `univoxel poses` does"
+        return "but it is HEIC or AVIF: convert it to JPEG, as `univoxel poses` does"
     with path.open("rb") as file:
         head = file.read(4)
     if head in (b"II*\0", b"MM\0*"):

@@ -91,13 +91,13 @@ def straightened(lens: Lens) -> Lens:
         return lens
     low, high = ZOOM
     if not _fits(lens, high):
-        raise UserError(f"its distortion leaves less than 1/{high:g} of the image width")
+        raise UserError(f"the lens distortion leaves less than 1/{high:g} of the image width")
     for _ in range(HALVINGS):
         middle = (low + high) / 2
         low, high = (low, middle) if _fits(lens, middle) else (middle, high)
     pinhole = _zoomed(lens, high)
     if _folds(lens, pinhole):
-        raise UserError("its distortion folds the image over: check the coefficients")
+        raise UserError("the lens distortion folds the image over: check the coefficients")
     return pinhole
 
 
@@ -179,7 +179,7 @@ def fitted(lens: Lens, picture: Path, where: str) -> Lens:
     across, down = w / lens.width, h / lens.height
     if abs(across / down - 1) > TALLER + 1 / min(w, h):
         raise DataError(
-            f"{picture}: expected an image with the shape {lens.width:g}x{lens.height:g} as in "
+            f"{picture}: expected the aspect ratio {lens.width:g}x{lens.height:g} of its camera in "
             f"{where}, got {w}x{h}{turn_note(picture)}"
         )
     (fx, fy), (cx, cy) = lens.focal, lens.centre

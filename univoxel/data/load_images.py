@@ -107,8 +107,8 @@ def read_shots(
     masks = bool(masks)
     _check(folder, shots, downscale)
     if split == "train" and len(shots) < FEWEST:
-        count = "one view does" if len(shots) == 1 else "two views do"
-        log.warning("%s: %s not give a shape: at least %d are needed", folder, count, FEWEST)
+        count = "one photograph is" if len(shots) == 1 else "two photographs are"
+        log.warning("%s: %s not enough for a shape: at least %d are needed", folder, count, FEWEST)
     factor = downscale or fitting_downscale(shots)
     pinholes = _pinholes(shots)
     cameras = cameras_of([s.pose for s in shots], [shrunk(lens, factor) for lens in pinholes])
@@ -461,7 +461,7 @@ def every_eighth(folder: Path, shots: Sequence[Shot], split: str) -> list[Shot]:
     ordered = sorted(shots, key=lambda shot: shot.name)
     chosen = [s for i, s in enumerate(ordered) if (i % TEST_EVERY == 0) == (split == "test")]
     if not chosen:
-        raise DataError(f"{folder}: expected at least two photographs, got {len(ordered)}")
+        raise DataError(f"{folder}: expected at least two photographs, found {len(ordered)}")
     return chosen
 
 
@@ -513,11 +513,11 @@ def upright(shots: Sequence[Shot]) -> tuple[list[Shot], list[str]]:
     held = np.stack([_right_and_up(shot) for shot in shots])
     up = up_direction(held)
     if up is None:
-        return shots, [*moved, "world not turned upright: its cameras do not show what is up"]
+        return shots, [*moved, "world not rotated: its cameras do not show which direction is up"]
     if up[2] >= math.cos(LEAN):
         return shots, moved
     turned = in_moved_world(shots, np.column_stack([turn_to_z(up), np.zeros(3)]))
-    return turned, [*moved, "world turned to +Z up"]
+    return turned, [*moved, "world rotated so that +Z is up"]
 
 
 def size_of(image: Tensor) -> str:
@@ -563,7 +563,7 @@ def up_direction(held: np.ndarray) -> np.ndarray | None:
 def check_name(name: str, where: str) -> None:
     """Refuse, by a DataError, names of views with which files would not stay in their folder."""
     if name in ("", "..") or Path(name).name != name or not system.can_be_a_name(name):
-        raise DataError(f"{where}: expected valid file names, got {name!r}")
+        raise DataError(f"{where}: expected a name that can be a file name, got {name!r}")
 
 
 def _check(folder: Path, shots: Sequence[Shot], downscale: int) -> None:
@@ -577,5 +577,5 @@ def _check(folder: Path, shots: Sequence[Shot], downscale: int) -> None:
         width, height = shot.lens.width, shot.lens.height
         if downscale > min(width, height):
             raise DataError(
-                f"{folder}: downscale={downscale} leaves no pixels of {width}x{height}", "downscale"
+                f"{folder}: downscale={downscale} leaves no pixel of {width}x{height}", "downscale"
             )

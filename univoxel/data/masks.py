@@ -48,9 +48,9 @@ FEWEST = 4  # of how many at least, before it is said
 # Along the edge of a right mask colours change more than elsewhere: 4 to 32 times as much in six
 # data sets, and 0.2 to 3 times along that of a mirrored one (6 of an object that is its mirror)
 FITS = 3.0
-WAYS = {2: "mirrored left to right", 3: "turned by 180 degrees", 4: "mirrored top to bottom"}
-WAYS |= {5: "mirrored about a diagonal", 6: "turned by 90 degrees to the left"}
-WAYS |= {7: "mirrored about a diagonal", 8: "turned by 90 degrees to the right"}
+WAYS = {2: "mirrored left to right", 3: "rotated by 180 degrees", 4: "mirrored top to bottom"}
+WAYS |= {5: "mirrored about a diagonal", 6: "rotated by 90 degrees to the left"}
+WAYS |= {7: "mirrored about a diagonal", 8: "rotated by 90 degrees to the right"}
 BRIGHT, SOFT = 100, 100  # of 255, of an object; pixels: for colours to tell of alpha
 WHITE = "give masks that are white on the object and black elsewhere"
 
@@ -402,7 +402,7 @@ def _of_palette(image: Image.Image, path: Path) -> Tensor:
     if len(things) > 1 or palette[0].any():
         named = [f"{n}: {palette[min(n, len(palette) - 1)].tolist()}" for n in used]
         raise DataError(
-            f"{path}: expected a mask of one object, got a palette with {len(used)} colours "
+            f"{path}: expected a mask of one object, got {len(used)} colours of a palette "
             f"({some(named)}): {WHITE}"
         )
     return torch.from_numpy(255 * (numbers > 0).astype(np.uint8))
@@ -459,8 +459,8 @@ def _scaled(levels: Tensor, path: Path) -> Tensor:
     code = round(255 * top) if floating else int(top)
     if code <= LABELS:
         raise DataError(
-            f"{path}: expected a mask that is white on the object, got a maximum of {code} of "
-            f"255, as in label images: {WHITE}"
+            f"{path}: expected a mask that is white on the object, got values of at most {code} "
+            f"of 255, as in label images: {WHITE}"
         )
     return levels.clamp(0, 1) if floating else levels.contiguous()
 
@@ -507,8 +507,8 @@ def require_fit(where: Path, views: Sequence[tuple[Tensor, Tensor]]) -> None:
     largest = max(float(mask.max()) for _, mask in views)
     if largest < 0.5 and len(views) >= FEWEST:
         raise DataError(
-            f"{where}: expected masks that are white on the object, got a maximum of "
-            f"{255 * largest:.0f} of 255 in {len(views)} samples: {WHITE}"
+            f"{where}: expected masks that are white on the object, got values of at most "
+            f"{255 * largest:.0f} of 255 in {len(views)} sampled masks: {WHITE}"
         )
     inverted, ways = 0, []
     for color, mask in views:

@@ -74,7 +74,7 @@ def left_out(where: str, missing: Sequence[object], listed: int, note: str = "")
             f"least {FEWEST}{note}"
         )
     log.warning("%s: missing images: %s (%s left out)", where, names, count)
-    return [f"{count} listed images left out because they are missing"]
+    return [f"{count} listed images are missing and left out"]
 
 
 # Arrays in the files of NumPy.
@@ -117,5 +117,5 @@ def read_npz(path: Path, prefix: str = "") -> dict[str, np.ndarray]:
     for key, value in found.items():
         if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
             kind = value.dtype if isinstance(value, np.ndarray) else type(value).__name__
-            raise DataError(f"{path}: expected arrays of numbers, got {key} of {kind}")
+            raise DataError(f"{path}: expected arrays of numbers, but {key} is of type {kind}")
     return found

@@ -75,7 +75,7 @@ def list_metashape(folder: Path, split: str) -> Listed:
     every = list(chunk.iterfind("cameras//camera"))
     placed = [c for c in every if c.find("transform") is not None and c.get("enabled") not in OFF]
     if not placed:
-        raise DataError(f"{path}: expected cameras with a transform, got {len(every)} without")
+        raise DataError(f"{path}: expected cameras with a transform, got {len(every)} without one")
     component, _ = Counter(c.get("component_id") for c in placed).most_common(1)[0]
     chosen = [c for c in placed if c.get("component_id") == component]
     world = _world(chunk, component, path)
@@ -118,14 +118,14 @@ def _xml_file(folder: Path) -> Path | None:
 def _chunk(path: Path) -> ET.Element:
     data = inside(path, str(path)).read_bytes()
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:  # which may grow without bound
-        raise DataError(f"{path}: expected Metashape XML, got XML with its own definitions")
+        raise DataError(f"{path}: expected Metashape XML, got XML with a DOCTYPE or ENTITY")
     try:
         root = ET.fromstring(data)
     except ET.ParseError as error:
         raise DataError(f"{path}: this XML could not be read: {error}") from None
     chunks = root.findall("chunk")
     if len(chunks) != 1:
-        raise DataError(f"{path}: expected one chunk, got {len(chunks)}")
+        raise DataError(f"{path}: expected one chunk, got {len(chunks)}: export only one")
     return chunks[0]
 
 
@@ -165,7 +165,7 @@ def _camera_pose(camera: ET.Element, world: tuple[float, np.ndarray], where: str
 def _sensor_lens(sensor: ET.Element | None, where: str) -> Lens:
     """The lens of a sensor, in the terms of OpenCV."""
     if sensor is None:
-        raise DataError(f"{where}: expected a known sensor, but it is not listed")
+        raise DataError(f"{where}: its sensor is not listed in the file")
     if (kind := sensor.get("type", "frame")) != "frame":
         raise DataError(f"{where}: expected a sensor of type frame, got {kind}")
     calibrations = sensor.findall("calibration")
@@ -182,7 +182,7 @@ def _sensor_lens(sensor: ET.Element | None, where: str) -> Lens:
     focal = parsed(calibration.findtext("f"), "f", where)
     term = {key: parsed(calibration.findtext(key, "0"), key, where) for key in TERMS}
     if term["p3"] or term["p4"]:
-        raise DataError(f"{where}: expected distortion k1 to k4, p1 and p2, got p3 or p4 too")
+        raise DataError(f"{where}: expected distortion k1 to k4, p1 and p2 only, got p3 or p4 too")
     values = {"fl_x": focal + term["b1"], "fl_y": focal}
     values |= {"cx": width / 2 + term["cx"], "cy": height / 2 + term["cy"]}
     values |= {"p1": term["p2"], "p2": term["p1"]}
@@ -345,7 +345,7 @@ def list_polycam(folder: Path, split: str) -> Listed:
         note += f"; those in {others} belong to the cameras in {others.with_name('cameras')}"
     lost = left_out(str(cameras[0].parent), missing, len(cameras), f"{note})")
     shots = every_eighth(folder, in_moved_world(shots, UPRIGHT), split)
-    return Listed("Polycam raw data", shots, [*lost, "world turned from +Y to +Z up"])
+    return Listed("Polycam raw data", shots, [*lost, "world rotated so that +Z is up (was +Y)"])
 
 
 def _place(folder: Path) -> str | None:

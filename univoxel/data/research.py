@@ -78,7 +78,7 @@ def _rows(path: Path) -> np.ndarray:
     if rows.ndim != 2 or rows.shape[1] != COLUMNS:
         raise DataError(f"{path}: expected [V, {COLUMNS}] numbers, got {np.shape(rows)}")
     if rows.dtype.kind not in "fiu" or not len(rows):
-        raise DataError(f"{path}: expected [V, {COLUMNS}] numbers, got {len(rows)} of {rows.dtype}")
+        raise DataError(f"{path}: expected [V, {COLUMNS}] numbers, got {len(rows)} x {rows.dtype}")
     return rows.astype(np.float64)
 
 
@@ -100,7 +100,7 @@ def _llff_lens(size_and_focal: np.ndarray, picture: Path, where: str) -> Lens:
     if not all(1 <= x < 1e9 for x in (height, width)) or not 0 < focal < 1e9:
         raise DataError(
             f"{where}: expected height, width and focal length above 0, got {height:g}, "
-            f"{width:g}, {focal:g}"
+            f"{width:g} and {focal:g}"
         )
     whole = Lens(int(width), int(height), (focal, focal), (width / 2, height / 2))
     return fitted(whole, picture, where)
@@ -227,7 +227,7 @@ def _numbers(path: Path, known: list[int], pictures: list[Path]) -> list[int]:
         return found
     raise DataError(
         f"{path}: expected a world_mat for each of {len(pictures)} photographs in "
-        f"{pictures[0].parent}, got {len(known)}, and names that are not their numbers"
+        f"{pictures[0].parent}, got {len(known)}, whose numbers are not in the photographs' names"
     )
 
 
@@ -279,7 +279,7 @@ def list_neilf(folder: Path, split: str) -> Listed:
         raise DataError(f"{path}: expected images with cameras (flg {PLACED}), got none")
     looked = f" (looked in {folder / 'inputs' / 'images'})"
     lost = left_out(str(path), missing, len(names) - unplaced, looked)
-    lost += [f"{unplaced} without a camera left out"] if unplaced else []
+    lost += [f"{unplaced} photographs without a camera left out"] if unplaced else []
     return turned_up(folder, split, "NeILF layout", shots, lost)
 
 
@@ -293,7 +293,7 @@ def _read(path: Path) -> tuple[dict[str, str], dict]:
             names = {str(index): name for index, name in enumerate(names)}
         found = {index: PureWindowsPath(name).name for index, name in names.items()}
         if not isinstance(images, dict) or not found:
-            raise TypeError("no images")
+            raise TypeError("no images are listed")
     except (KeyError, TypeError, AttributeError) as error:
         raise DataError(
             f"{path}: expected JSON with image_path.file_paths and camera_track_map.images, "
@@ -313,8 +313,8 @@ def _camera(image: dict, where: str) -> tuple[Lens, np.ndarray]:
         to_camera = np.array(matrix, np.float64).reshape(4, 4)
     except (KeyError, IndexError, TypeError, ValueError, OverflowError) as error:
         raise DataError(
-            f"{where}: expected size [w, h] and a camera of focal, ppt and 16 numbers as "
-            f"extrinsic, got {short(image)} ({error!r})"
+            f"{where}: expected size [w, h] and a camera with focal, ppt and an extrinsic of 16 "
+            f"numbers, got {short(image)} ({error!r})"
         ) from None
     width, height = (int(read_number(values, key, where, 0, math.inf)) for key in ("w", "h"))
     rotation = pose_of(to_camera, where)[:, :3].T
@@ -375,7 +375,8 @@ def _shot(view: Path, picture: str) -> Shot:
         raise
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(
-            f"{path}: expected JSON with cam_transform_mat, numbers between commas, got {error!r}"
+            f"{path}: expected JSON with cam_transform_mat, numbers separated by commas, got "
+            f"{error!r}"
         ) from None
     if len(values) != 16:
         raise DataError(f"{path}: expected 16 numbers in cam_transform_mat, got {short(text)}")

@@ -83,7 +83,7 @@ def load_cameras(
         width, height = (int(read_number(values, key, where, 0, WIDEST)) for key in ("w", "h"))
         lens = lens_of(values, where, width, height)
         if lens.bent:
-            raise DataError(f"{where}: expected cameras without distortion, got some")
+            raise DataError(f"{where}: expected cameras without distortion, got distorted ones")
         lenses.append(lens)
     return names, load_images.cameras_of(poses, lenses)
 
@@ -159,7 +159,7 @@ def read_frames(path: Path) -> tuple[dict[str, Any], list[load_images.Shot], lis
             "images, add that size as w and h",
             *(path, first.width, first.height),
         )
-    lost += [f"cameras of {scaled} scaled to smaller images"] if scaled else []
+    lost += [f"{scaled} cameras scaled to smaller images"] if scaled else []
     return root, shots, lost
 
 
@@ -298,9 +298,9 @@ def pose_of(matrix: object, where: str) -> np.ndarray:
     if pose.shape not in ((4, 4), (3, 4)) or not np.isfinite(pose).all():
         raise DataError(f"{where}: expected a finite 4x4 transform_matrix, got {short(matrix)}")
     if len(pose) == 4 and not np.allclose(pose[3], [0, 0, 0, 1], atol=RIGID_TOLERANCE, rtol=0):
-        raise DataError(f"{where}: expected the last row 0 0 0 1, got {pose[3].tolist()}")
+        raise DataError(f"{where}: transform_matrix must end with 0 0 0 1, got {pose[3].tolist()}")
     if (largest := np.abs(pose).max()) > FARTHEST:
-        raise DataError(f"{where}: expected numbers up to {FARTHEST:.0e}, got {largest:.4g}")
+        raise DataError(f"{where}: expected matrix values up to {FARTHEST:.0e}, got {largest:.4g}")
     u, scale, v = np.linalg.svd(pose[:3, :3])
     if np.abs(scale - 1).max() > RIGID_TOLERANCE:
         raise DataError(
@@ -331,7 +331,7 @@ def lens_of(values: dict[str, Any], where: str, width: int, height: int, note: s
             + ("a fisheye" if values.get("is_fisheye") else short(model))
         )
     if more := [key for key in ("k4", "k5", "k6") if values.get(key)]:
-        raise DataError(f"{where}: expected distortion k1 k2 k3 p1 p2, got {more[0]} too")
+        raise DataError(f"{where}: expected distortion k1 k2 k3 p1 p2 only, got {more[0]} too")
     if "fl_x" in values:
         x = read_number(values, "fl_x", where, 0.0, math.inf)
         y = read_number(values, "fl_y", where, 0.0, math.inf) if "fl_y" in values else x
@@ -470,8 +470,8 @@ def _named(
     names = [known.get(name) or known.get(view_name(name)) for name in chosen]
     if None in names or not names:
         came = view_name(chosen[names.index(None)]) if names else "an empty list"
-        raise DataError(f"{path}: expected frames of the file in {key}, got {came}")
+        raise DataError(f"{path}: expected only frames of the file in {key}, got {came}")
     found = [by_name[name] for name in names if name in by_name]
     if not found:
-        raise DataError(f"{path}: expected frames with images in {key}, got {len(names)} without")
+        raise DataError(f"{path}: expected frames with images in {key}, got none of {len(names)}")
     return found

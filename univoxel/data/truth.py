@@ -119,7 +119,7 @@ def read_ply(path: Path) -> Mesh:
             f"{path}: expected vertices x y z and triangles, got something else: {error}"
         ) from None
     if (sides != 3).any() or (len(index) and not 0 <= index.min() <= index.max() < len(corner)):
-        raise DataError(f"{path}: expected triangles of the {len(corner)} vertices")
+        raise DataError(f"{path}: expected triangles that index the {len(corner)} vertices")
     if not np.isfinite(corner).all():
         raise DataError(f"{path}: expected finite vertices, got NaN or infinity")
     return Mesh(torch.from_numpy(corner), torch.from_numpy(index))

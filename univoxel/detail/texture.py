@@ -530,7 +530,7 @@ def load_detail(run: str | Path) -> Detail | None:
             came = f"{about.get('format')!r:.40}"
             raise DataError(f"{path}: expected detail in format {FORMAT}, got {came}; {remedy}")
         if about["checkpoint"] != _fingerprint(Path(run)):
-            raise DataError(f"{path}: it belongs to another checkpoint than {CHECKPOINT}; {remedy}")
+            raise DataError(f"{path}: it belongs to a checkpoint other than {CHECKPOINT}; {remedy}")
         if about["picture"] != _digest(picture):
             raise DataError(f"{picture}: it is not the file that {MESH} was written with; {remedy}")
         albedo = torch.from_numpy(np.array(Image.open(picture).convert("RGB")))
@@ -549,7 +549,7 @@ def _check(detail: Detail) -> None:
     for rows, index in ((detail.vertices, faces), (detail.uv, corners)):
         within = len(index) and 0 <= int(index.min()) <= int(index.max()) < len(rows)
         if index.shape != (len(faces), 3) or not within or not bool(rows.isfinite().all()):
-            raise ValueError("its faces and vertices do not fit")
+            raise ValueError("its faces and vertices do not match")
     if not 0 < detail.reach < math.inf:
         raise ValueError(f"reach must be above 0, got {detail.reach}")
 

@@ -327,7 +327,7 @@ def measure_full_size(
 
 # By key: what the table says of it
 FULL_MEASURES = {
-    "full_psnr": "full size: novel views, PSNR of the object, dB, a gain per channel",
+    "full_psnr": "full size: novel views, PSNR of the object, dB, scaled per channel",
     "full_ssim": "full size: SSIM",
     **{
         f"full size: coherence, octave {k + 1}": f"at full size: coherence, octave {k + 1}"

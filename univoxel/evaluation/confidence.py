@@ -326,9 +326,8 @@ def words(figures: dict[str, float], troubles: list[str]) -> str:
         troubles: what went wrong in training, from its state.
     """
     sentences = [
-        f"Uncertainty of the albedo {figures['doubt_albedo']:.2f}, of the roughness "
-        f"{figures['doubt_roughness']:.2f}, averaged over the surface (0: well determined, 1: a "
-        "guess)."
+        f"Mean uncertainty over the surface: {figures['doubt_albedo']:.2f} for the albedo, "
+        f"{figures['doubt_roughness']:.2f} for the roughness (0: well determined, 1: a guess)."
     ]
     shares = {
         "few_views": f"is seen by fewer than {FEW_VIEWS} cameras: its materials are a guess",

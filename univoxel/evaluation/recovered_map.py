@@ -43,7 +43,7 @@ def recovered_map(scene: Scene, run: Path, height: int) -> Tensor:
     sky = scene.environment()
     if sky is None:
         raise UserError(
-            f"{run}: this run has no environment map: it was trained with local light "
+            f"{run}: this run has no environment map, because it was trained with local light "
             f"({scene.cfg.light.kind}) only"
         )
     return scene.exposed(sky.latlong(height))

@@ -146,7 +146,8 @@ class Levels:
         check_fields(self, "above 0", lambda x: x and all(0 < v < math.inf for v in x), sizes)
         check_fields(self, "a power of two", lambda x: x >= 1 and x & (x - 1) == 0, "rows")
         if not all(map(le, self.lower, self.upper)):
-            raise ConfigError(f"Levels: lower must be at most upper, got {self.lower}")
+            both = f"{self.lower} and {self.upper}"
+            raise ConfigError(f"Levels: lower must be at most upper, got {both}")
 
     @classmethod
     def of(cls, box: tuple[Tensor, Tensor], finest: float, count: int, rows: int = ROWS) -> Levels:

@@ -80,7 +80,7 @@ def read_config(values: dict[str, Any]) -> LightConfig:
             its range.
     """
     if not isinstance(values, dict):
-        raise ConfigError(f"light must be an object, got {values!r:.60}")
+        raise ConfigError(f"light must be a JSON object, got {values!r:.60}")
     values = dict(values)
     kind = values.pop("kind", "sg")  # files from before there were others do not say
     kinds = {c.kind: c for c in get_args(LightConfig)}

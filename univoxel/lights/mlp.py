@@ -34,12 +34,10 @@ class MLPLightConfig(LocalLightConfig):
     """Local light as two networks."""
 
     kind: Literal["mlp"] = field(default="mlp", init=False, metadata=KIND)
-    rank: int = setting(
-        32, "basis functions of direction that a point's light is composed of", least=1
-    )
+    rank: int = setting(32, "number of basis functions that compose the light at a point", least=1)
     hidden: int = setting(64, "width of both networks", least=1)
     layers: int = setting(2, "hidden layers of both networks", least=0, most=MOST_LAYERS)
-    frequencies: int = setting(3, "frequencies of the direction's encoding", least=0)
+    frequencies: int = setting(3, "number of frequencies in the encoding of the direction", least=0)
     directions: int = setting(256, "directions in training", least=1, most=MOST_DIRECTIONS)
     directions_eval: int = setting(512, "directions in evaluation", least=1, most=MOST_DIRECTIONS)
     scale: float = setting(1.0, "half the extent of the lit region", unit="world units", above=0)

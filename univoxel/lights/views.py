@@ -87,7 +87,7 @@ class ViewLights(nn.Module):
             self.chosen = int(view)
         else:
             raise UserError(
-                f"light_of: expected a number below {len(self)} or one of {self.names[0]} to "
+                f"light_of: expected a number below {len(self)} or a name from {self.names[0]} to "
                 f"{self.names[-1]}, got {view!r}",
                 "light_of",
             )
@@ -204,7 +204,7 @@ class Table:
     axis: Vec3 = field(metadata=about("unit vector, pointing up"))
     start: Vec3 = field(metadata=about("unit vector from the axis to the camera"))
     eyes: tuple[Vec3, ...] = setting(
-        (), "positions of its cameras; empty: all stood around this axis"
+        (), "positions of its cameras; empty: all cameras are around this axis"
     )
 
     def __post_init__(self) -> None:
@@ -255,12 +255,12 @@ class Turntable(Table):
     show its underside, has another axis for the photographs since then.
     """
 
-    others: tuple[Table, ...] = setting((), "other tables, each with its own eyes")
+    others: tuple[Table, ...] = setting((), "rotation axes of the object's other positions")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.others and not all(table.eyes for table in (self, *self.others)):
-            raise ConfigError("Turntable: each of several tables needs the eyes of its cameras")
+            raise ConfigError("Turntable: each of several axes needs eyes, its cameras' positions")
 
     @staticmethod
     def of(cameras: Cameras) -> Turntable | None:

@@ -68,7 +68,7 @@ def check_bricks(op: str, bricks: Bricks, **pools: tuple[Tensor, str]) -> None:
         TypeError, ValueError: as `check`; bricks is none, or of another size.
     """
     if not isinstance(bricks, Bricks):
-        raise TypeError(f"{op}: bricks must be Bricks, got {type(bricks).__name__}")
+        raise TypeError(f"{op}: bricks must be of the type Bricks, got {type(bricks).__name__}")
     n = len(bricks.place)
     wanted = {"R": Bricks.NODES * n, "n": n}
     for name, (tensor, words) in pools.items():

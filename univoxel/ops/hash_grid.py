@@ -92,13 +92,13 @@ def check_levels(
         raise ValueError(f"{op}: lower must be at most upper, got {list(lower)} and {list(upper)}")
     if not levels or not all(0 < h < math.inf for h in voxel_sizes):
         raise ValueError(
-            f"{op}: voxel_sizes must be numbers above 0, at least one, got {list(voxel_sizes)}"
+            f"{op}: voxel_sizes must be one or more numbers above 0, got {list(voxel_sizes)}"
         )
     each = rows // levels
     if each * levels != rows or each < 1 or each & (each - 1) or each > 2**31:
         raise ValueError(
-            f"{op}: table must have a power of two rows for each of {levels} levels, got {rows} in "
-            "all"
+            f"{op}: the number of rows of table must be a power of two for each of {levels} "
+            f"levels, got {rows} in all"
         )
 
 

@@ -95,7 +95,7 @@ def _load() -> tuple[ModuleType | None, str]:
             return None, f"{built[variant].name} ({variant}): {error}"
         sys.modules["univoxel._core"] = module
         return module, variant
-    return None, f"no extension built under {FOLDER}"
+    return None, f"no compiled extension in {FOLDER}"
 
 
 core: ModuleType | None

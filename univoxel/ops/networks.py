@@ -35,8 +35,8 @@ def mlp(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tenso
     weights, biases = list(weights), list(biases)
     if not weights or len(weights) != len(biases):
         raise ValueError(
-            f"mlp: weights and biases must be one for each of the layers, at least one, got "
-            f"{len(weights)} and {len(biases)}"
+            f"mlp: expected one of weights and one of biases for each of one or more layers, got "
+            f"{len(weights)} weights and {len(biases)} biases"
         )
     layers: dict[str, tuple[Tensor, str]] = {}
     for i, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
@@ -45,7 +45,7 @@ def mlp(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tenso
     sizes = check("mlp", x=(x, "N H0"), **layers)
     empty = [name for name, size in sizes.items() if name != "N" and size < 1]
     if empty:
-        raise ValueError(f"mlp: every size must be at least 1, got {empty[0]}=0")
+        raise ValueError(f"mlp: every layer must be at least 1 wide, got {empty[0]}=0")
     if native.serves(x):
         return _mlp(
             x.contiguous(), [w.contiguous() for w in weights], [b.contiguous() for b in biases]

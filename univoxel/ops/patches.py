@@ -234,7 +234,7 @@ def match_cost(
         raise ValueError(f"match_cost: best must lie in [1, {sizes['M']}], got {best}")
     if steps < 1 or radius < 0:
         raise ValueError(
-            f"match_cost: steps must be at least 1 and radius at least 0, got {steps} and {radius}"
+            f"match_cost: expected steps >= 1 and radius >= 0, got {steps=} and {radius=}"
         )
     rays = (origin, direction, start, color, rows, others)
     if not native.serves(start):
@@ -317,7 +317,7 @@ def semi_global(cost: Tensor, rows: Tensor, small: float, large: float) -> Tenso
     sizes = check("semi_global", cost=(cost, "N K", torch.float32), rows=(rows, "H W", torch.int64))
     _check_rows("semi_global", rows, sizes["N"])
     if not 0 <= small <= large:
-        raise ValueError(f"semi_global: 0 <= small <= large, got {small} and {large}")
+        raise ValueError(f"semi_global: 0 <= small <= large must hold, got {small} and {large}")
     if not native.serves(cost):
         return semi_global_reference(cost, rows, small, large)
     cost, rows = cost.contiguous(), rows.contiguous()
@@ -354,4 +354,4 @@ def _check_rows(op: str, rows: Tensor, count: int) -> None:
     """Each of the N rays is the ray of one pixel."""
     named = rows[rows >= 0].sort().values
     if not torch.equal(named, torch.arange(count, device=rows.device)):
-        raise ValueError(f"{op}: rows must name each of the {count} rays once, and -1 elsewhere")
+        raise ValueError(f"{op}: rows must contain each of the {count} rays once, else -1")

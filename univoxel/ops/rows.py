@@ -149,8 +149,8 @@ def sum_rows(
     """
     if not rows or len(rows) != len(values):
         raise ValueError(
-            f"sum_rows: rows and values must be as many lists, at least one, got {len(rows)} and "
-            f"{len(values)}"
+            f"sum_rows: expected equally many rows and values, at least one of each, got "
+            f"{len(rows)} and {len(values)}"
         )
     arguments: dict = {}
     for i, (r, v) in enumerate(zip(rows, values, strict=True)):
@@ -158,7 +158,7 @@ def sum_rows(
         arguments[f"values[{i}]"] = (v, f"K{i} C")
     check("sum_rows", **arguments)
     if not shape or any(size < 1 for size in shape):
-        raise ValueError(f"sum_rows: shape must be sizes of at least 1, got {list(shape)}")
+        raise ValueError(f"sum_rows: every size in shape must be at least 1, got {list(shape)}")
     if not native.serves(values[0]):
         return sum_rows_reference(rows, values, shape)
     core, threads = native.require(), native.threads()

@@ -47,7 +47,7 @@ def smooth_rows_(
     if not 0 <= amount <= 1:
         raise ValueError(f"smooth_rows_: amount must be in [0, 1], got {amount}")
     if not grid.is_contiguous():
-        raise ValueError("smooth_rows_: grid changes in place, so it must be contiguous")
+        raise ValueError("smooth_rows_: grid is changed in place, so it must be contiguous")
     if not native.serves(grid):
         return smooth_rows_reference_(grid, rows, amount, order, bricks)
     core, rows = native.require(), rows.contiguous()
@@ -115,9 +115,9 @@ def diffuse_rows_(
     if passes < 0:
         raise ValueError(f"diffuse_rows_: passes must be at least 0, got {passes}")
     if len(size) != 3 or (bricks is not None and tuple(size) != tuple(bricks.size)):
-        raise ValueError(f"diffuse_rows_: size must be that of the grid, [X, Y, Z], got {size}")
+        raise ValueError(f"diffuse_rows_: size must be the size [X, Y, Z] of the grid, got {size}")
     if not values.is_contiguous():
-        raise ValueError("diffuse_rows_: values change in place, so they must be contiguous")
+        raise ValueError("diffuse_rows_: values are changed in place, so they must be contiguous")
     if not native.serves(values):
         return diffuse_rows_reference_(values, rows, size, amount, passes, bricks)
     core, of_rows = native.require(), rows.contiguous().numpy()

@@ -388,8 +388,8 @@ def placement_of(
     turn, at = torch.from_numpy(moved[:, :3].T.copy()), torch.from_numpy(moved[:, 3].copy())
     if (away := float((middle - at).norm())) > FARTHEST * side:
         raise UserError(
-            f"export: the object of size {side:.4g} is {away:.6g} from the origin, which is too "
-            "far for the digits of mesh files: use another origin",
+            f"export: the object of size {side:.4g} is {away:.6g} away from the origin, which is "
+            "too far for the precision of mesh files: use another origin",
             "origin",
         )
     return Placement(at, scale, turn)

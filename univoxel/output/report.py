@@ -91,7 +91,7 @@ def configuration(run: Path) -> TrainConfig | None:
     try:
         return load_config(run / "config.json")
     except (UserError, OSError) as error:
-        log.info("stages are missing: %s", error)
+        log.info("no table of stages: %s", error)
         return None
 
 
@@ -147,11 +147,11 @@ FOLDER = Path(__file__).parent / "web"
 RING_GAP = 60.0  # degrees between neighbouring azimuths that are worth a word, as in `poses`
 TRUTH = "This report uses no ground truth: it is computed from the photographs and the model."
 CHARTS = (
-    "Stages minimise different sums, so the loss jumps between them. The validation PSNR is "
+    "Stages minimise different losses, so the curve jumps between them. The validation PSNR is "
     "that of the radiance head first, and that of light and materials once they are trained."
 )
 LAYERS = {
-    "render": "in the light of the photographs",
+    "render": "under the light of the photographs",
     "albedo": "colour without light",
     "roughness": "black is glossy, white is matte",
     "metal": "white is metal",
@@ -240,8 +240,8 @@ def report_text(
     sections = [
         ("Result", paragraph(verdict.sentence() + ".") if verdict else ""),
         ("What to photograph next", next_section(known.advice) if known else paragraph(why)),
-        ("Doubt", doubt_section(known, state, pictures.pop("doubt", [])) if known else ""),
-        ("Photographs and render", views_section(scene, known, options) if known else ""),
+        ("Uncertainty", doubt_section(known, state, pictures.pop("doubt", [])) if known else ""),
+        ("Photographs and renders", views_section(scene, known, options) if known else ""),
         ("Materials", materials_section(pictures)),
         ("Light", light_section(scene, mesh)),
         ("Training", training_section(run, state)),
@@ -283,9 +283,9 @@ def next_section(advice: Advice) -> str:
             (f"{k + 1}", _direction(advice, k), escape(near), f"{gain:.1%}")
             for k, (near, gain) in worth
         ]
-        parts.append(table(rows, ("", "from", "nearest so far", "worth")))
+        parts.append(table(rows, ("", "direction", "nearest photograph", "worth")))
     else:
-        parts.append(paragraph("There are photographs from all useful directions."))
+        parts.append(paragraph("The photographs cover all useful directions."))
     told = [f"{line[0].upper()}{line[1:]}." for line in missing(advice, RING_GAP)]
     if advice.hidden >= 0.01:
         told.append(
@@ -300,8 +300,8 @@ def next_section(advice: Advice) -> str:
     legend = (
         "Directions around the object, seen from above. White dots: photographs. Bright: a "
         "photograph from there would help. Rings: gaps without photographs. Numbers: "
-        "photographs to take, the best first. Worth: the share of the surface that a photograph "
-        "would resolve at most."
+        "photographs to take, the best first. Worth: the largest share of the surface that a "
+        "photograph could resolve."
     )
     left = "\n".join(parts)
     figure = f"<figure>{report_pictures.sphere(advice)}<figcaption>{legend}</figcaption></figure>"
@@ -385,7 +385,7 @@ def training_section(run: Path, state: dict[str, Any]) -> str:
         made = "" if fact.made is None else f"{fact.made:.0%}"
         took = "" if fact.seconds is None else f"{fact.seconds:.1f} s"
         rows.append((f"{k + 1}: {fact.name}", f"{fact.planned:,}", made, took, fact.fate))
-    parts.append(table(rows, ("stage", "planned steps", "made", "time", "")))
+    parts.append(table(rows, ("stage", "planned steps", "completed", "time", "")))
     limit = "" if cfg.minutes is None else f"The time limit was {60 * cfg.minutes:,.0f} s."
     told = [limit, *remarks(cfg, state)]
     return "\n".join([*parts, *(paragraph(line) for line in told)])

@@ -51,7 +51,7 @@ def surface_of(scene: Scene, cameras: Cameras | None = None) -> Mesh:
     mesh, dropped = cleaned(Mesh(*scene.field.isosurface(closed=True)))
     if dropped.crumbs or dropped.voids:
         log.info(
-            "mesh: %d small pieces beside the object and %d hollows inside it were left out",
+            "mesh: left out %d small pieces beside the object and %d hollows inside it",
             dropped.crumbs,
             dropped.voids,
         )
@@ -63,7 +63,7 @@ def surface_of(scene: Scene, cameras: Cameras | None = None) -> Mesh:
     mesh = smoothed(mesh, seen, REACH * scene.field.voxel_size)
     assert mesh.seen is not None
     if guess := float((mesh.seen < 0.5).float().mean()):
-        log.info("mesh: %.1f %% of it is smooth, because no photograph shows it", 100 * guess)
+        log.info("mesh: smoothed %.1f %% of it, because no photograph shows that part", 100 * guess)
     return mesh
 
 

@@ -94,7 +94,7 @@ def views_of(
     if word == "orbit":
         if count and not (count.isdigit() and int(count)):
             raise UserError(
-                f"relight: cameras: expected orbit or orbit N, N frames, got {str(cameras)!r}",
+                f"relight: cameras: expected orbit, or orbit N for N frames, got {str(cameras)!r}",
                 "cameras",
             )
         if not -90 < elevation < 90:

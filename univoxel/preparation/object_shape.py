@@ -186,8 +186,8 @@ def box_corners(box: Sequence[float]) -> Tensor:
     sides = list(zip(values[:3], values[3:], strict=False))
     if len(values) != 6 or not all(-math.inf < a < b < math.inf for a, b in sides):
         raise UserError(
-            "box: expected X0 Y0 Z0 X1 Y1 Z1, with each of the first three below its "
-            f"counterpart, got {words_of(values)}",
+            "box: expected X0 Y0 Z0 X1 Y1 Z1 with X0 < X1, Y0 < Y1 and Z0 < Z1, got "
+            f"{words_of(values)}",
             "box",
         )
     return torch.tensor(values).view(2, 3)
@@ -223,7 +223,7 @@ def nothing_inside(box: Tensor, what: str, cameras: Cameras) -> UserError:
     return UserError(
         f"box: expected a box around the object, got {words_of(box.flatten().tolist())}, in "
         f"which {what}; the cameras look at {words_of(looked_at(cameras).tolist())}, and half of "
-        f"them show {reach(cameras):.4g} around it",
+        f"them show at least {reach(cameras):.4g} around that point",
         "box",
     )
 
@@ -249,9 +249,9 @@ def find_object(
     first = fit_grid(*corners, FIRST_VOXELS**3)
     share = in_box(share_of(votes(shown, maps, first), len(masks)), first, box)
     if box is not None and share.max() < AROUND:
-        raise nothing_inside(box, "most masks have nothing in common", cameras)
+        raise nothing_inside(box, "most masks do not overlap", cameras)
     if not float(share.max()):
-        raise UserError("the masks have nothing in common: check masks and cameras")
+        raise UserError("the masks overlap in no part of the scene: check masks and cameras")
     coarse = around(first, share >= AROUND * share.max(), FIRST_VOXELS**3, 0)
     found = votes(shown, maps, coarse)
     share = in_box(share_of(found, len(masks)), coarse, box)
@@ -263,7 +263,7 @@ def find_object(
         raise nothing_inside(box, "masks and depth leave no shape", cameras)
     if not (inside > 0).any():
         raise UserError(
-            "the masks of the photographs are too faint or too few to have a common shape"
+            "the masks of the photographs are too faint or too few to determine the object's shape"
         )
     return ObjectShape(grid, largest_part(inside), surface)
 

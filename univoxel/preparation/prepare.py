@@ -168,7 +168,7 @@ def say_clipped(photos: Photos) -> None:
     share = clipped_share(photos)
     if share > MUCH_CLIPPED:
         log.info(
-            "%.0f %% of the object is overexposed; detail is lost there. Expose darker next time",
+            "%.0f %% of the object is overexposed, so detail is lost there. Expose less next time",
             100 * share,
         )
 
@@ -201,7 +201,7 @@ def varying_and_gains(
             return varying, None
         varying = "exposure"
         log.info(
-            "exposures differ by %.2f stops between photographs: a gain is learned for each; "
+            "exposures differ by %.2f stops between photographs, so a gain is learned for each; "
             "see varying",
             stops,
             extra={"arguments": ("varying",)},

@@ -69,7 +69,7 @@ def doubt_masks(photos: Photos, distance: Tensor, belief: Belief) -> Doubted:
     fill_(distance, photos, pixels)
     box = estimate_bounds(distance, cameras, belief.votes)
     off = contradiction(distance, cameras, box, pixels)
-    told = "the other masks; depth contradicts most masks and is ignored"
+    told = "the other masks (depth is ignored, because it disagrees with most masks)"
     if shape.surface:
         told = "the other masks and the depth of the photographs, which covers "
         told += f"{shape.surface:.0%} of the surface"

@@ -189,5 +189,5 @@ def sample_mesh(mesh: Mesh, count: int, generator: torch.Generator) -> Tensor:
 def _same_size(function: str, value: Tensor, truth: Tensor) -> None:
     if value.shape != truth.shape:
         raise ValueError(
-            f"{function}: expected sizes to agree, got {list(value.shape)} and {list(truth.shape)}"
+            f"{function}: expected equal sizes, got {list(value.shape)} and {list(truth.shape)}"
         )

@@ -109,8 +109,8 @@ class Sun:
         x, y, z = self.direction
         azimuth, elevation = math.degrees(math.atan2(y, x)), math.degrees(math.asin(z))
         return (
-            f"a sun at about azimuth {azimuth:.0f} and elevation {elevation:.0f} degrees sends "
-            f"{self.share:.0%} of the light"
+            f"a sun at about {azimuth:.0f} degrees azimuth and {elevation:.0f} degrees elevation "
+            f"gives {self.share:.0%} of the light"
         )
 
 

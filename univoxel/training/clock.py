@@ -324,9 +324,9 @@ class Clock:
         did."""
         if not (short := self.short()):
             return ""
-        stages = ", ".join(f"{made:.0%} for {name}" for name, made in short.items())
+        stages = ", ".join(f"{made:.0%} of {name}" for name, made in short.items())
         why = "the training was stopped" if self.finished else "the time limit ended the training"
-        return f"{why} early: of the planned steps it made {stages}"
+        return f"{why} early (completed steps: {stages})"
 
     def minutes_for_all(self) -> float:
         """Minutes in which all steps would have been made, as those that were made went."""

@@ -169,7 +169,7 @@ class Guard:
             self._progress.clock.abandon()
             return
         done = "returned to the last good state" if back else otherwise
-        self._progress.trouble(f"{where}; {done}, step size now times {self.scale:g}")
+        self._progress.trouble(f"{where}; {done}, step size multiplied by {self.scale:g}")
 
 
 # When validation pixels do not improve any more.

@@ -58,7 +58,7 @@ MIN_PARTS = 2
 
 
 NEWTON_CHUNK = 256  # points whose equations are built at once
-UNSOLVABLE = "the equations for the environment map have no solution: it stays for this round"
+UNSOLVABLE = "the equations for the environment map have no solution: it is unchanged in this round"
 
 
 @dataclass(frozen=True)

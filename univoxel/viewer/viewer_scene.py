@@ -54,7 +54,7 @@ class Subject:
             UserError: they are not there any more.
         """
         if self.run is None:
-            raise UserError("view: expected the folder of a run with photographs, got none")
+            raise UserError("view: this needs the photographs of a run, so pass the run's folder")
         return self.scene.registered(photos_of(self.run, split="train"))
 
     @cached_property
