@@ -377,7 +377,9 @@ def training_section(run: Path, state: dict[str, Any]) -> str:
         parts.append(paragraph("This training has no log to draw."))
     cfg = configuration(run)
     if cfg is None:
-        return "\n".join([*parts, paragraph("The stages are missing: config.json could not be read.")])
+        return "\n".join(
+            [*parts, paragraph("The stages are missing: config.json could not be read.")]
+        )
     rows = []
     if (before := prepared(state)) is not None:
         rows.append(("preparation", "", "", f"{before:.1f} s", ""))
