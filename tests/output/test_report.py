@@ -215,7 +215,7 @@ def test_what_time_cut_is_told(tmp_path):
     told = report.remarks(cfg, state)
     assert told[0] == "Training has not ended: it is in stage 4."
     assert "(completed steps: 40% of shape)" in told[1]
-    assert "trouble 1 times, the last in a." in told[2]
+    assert "recovered 1 times, last in a." in told[2]
     assert report.stage_ends({}) == []
     assert report.prepared({}) is None
 
@@ -267,7 +267,7 @@ def test_a_run_whose_photographs_are_gone_shows_what_is_left(run, data, tmp_path
         report_text(moved, scene, state, ReportOptions(data=tmp_path / "gone"))
     (moved / "config.json").write_text("{")
     text = report_text(moved, scene, state, ReportOptions(size=SIZE))
-    assert "no table of stages" in text
+    assert "The stages are missing" in text
 
 
 def test_metal_is_a_layer_where_there_is_any(tmp_path):
