@@ -67,7 +67,7 @@ def test_photographs_become_a_mesh_and_a_page(captured):
     page = captured.page.read_text("utf-8")
     assert "(mug.glb)" in page
     assert "(cut/masks.html)" in page
-    assert "Made of " in page
+    assert "Made from " in page
     assert "novel views, PSNR" in page
     assert univoxel.open_run(captured.run).path == captured.run
 
@@ -80,7 +80,7 @@ def test_the_same_again_only_says_what_is_there(captured, photographs, caplog):
     said = [r.getMessage() for r in caplog.records]
     there = ("cameras", "masks", "training", "mesh", "pictures")
     for n, step in enumerate(there, 1):
-        assert said[n - 1].startswith(f"step {n} of 6, {step}: there already, {out}")
+        assert said[n - 1].startswith(f"step {n} of 6, {step}: kept from before, {out}")
     assert said[5] == f"step 6 of 6, page: {out}/index.html"
     assert all(line.startswith("mesh: ") for line in said[6:])  # of the page's
     after = files_of(out)
@@ -127,8 +127,8 @@ def test_other_photographs_are_refused(captured, photographs, tmp_path):
         file.write(b"\0")
     for folder, why in (
         (more, "IMG_99.jpg was not part of it"),
-        (fewer, "IMG_03.jpg is not there now"),
-        (other, "IMG_04.jpg is another file now"),
+        (fewer, "IMG_03.jpg is missing now"),
+        (other, "IMG_04.jpg has changed since"),
     ):
         with pytest.raises(ExistingFile, match=f"holds a capture of IMG_00.jpg and 10 .*{why}"):
             capturing.make((folder, masks), out)
@@ -199,7 +199,7 @@ def test_a_run_takes_the_place_of_three_steps(captured, tmp_path, caplog):
     assert {p.name for p in made.page.parent.iterdir()} == {
         *("again.glb", "steps.json", "index.html", "pictures")
     }
-    assert f"step 3 of 6, training: there already, {captured.run}" in caplog.text
+    assert f"step 3 of 6, training: kept from before, {captured.run}" in caplog.text
     with pytest.raises(UserError, match="is a trained run: masks, network, box, preset"):
         task.capture(captured.run, tmp_path / "other", minutes=2.0)
     with pytest.raises(UserError, match="is a trained run: masks"):
@@ -299,7 +299,7 @@ def test_masks_of_ones_own_go_on(steps, pictures, tmp_path):
         ("train", (out / "cut").absolute(), False),
     ]
     page = (out / "index.html").read_text("utf-8")
-    assert "Made of 0.png and 2 others" in page
+    assert "Made from 0.png and 2 others" in page
     assert "31.25" in page
 
 
@@ -333,7 +333,7 @@ def test_another_box_makes_other_masks(steps, pictures, tmp_path, monkeypatch):
     task.find_data(pictures, out, masks="none", box=box, keep_table=True)
     assert steps[1:] == [("cutout", out / "scene", "none", box, True)]
     task.find_data(pictures, out, masks="none", box=list(box), keep_table=True)  # goes on
-    said = r"with masks=none, box=0.0 0.0 0.0 1.0 1.0 0.5, keep_table=True: to make them anew"
+    said = r"with masks=none, box=0.0 0.0 0.0 1.0 1.0 0.5, keep_table=True: to make them again"
     with pytest.raises(ExistingFile, match=said):
         task.find_data(pictures, out, masks="none", box=box)
     scene = task.SCENE
@@ -401,15 +401,13 @@ def test_a_turntable_gets_masks_first(steps, pictures, tmp_path, monkeypatch, ca
     monkeypatch.setattr("univoxel.capture.masks.mask_network", red_is_the_object)
     with caplog.at_level(logging.INFO, "univoxel"):
         task.capture(pictures, out)
-    assert "9 of 10 pairs: the object was turned before a still camera, so masks first" in (
-        caplog.text
-    )
+    assert "static in 9 of 10 pairs, as on a turntable: masks are made first" in caplog.text
     assert steps == [
         ("poses", pictures, out / "masks"),
         ("cutout", out / "scene", out / "scene" / "masks"),
         ("train", (out / "cut").absolute(), False),
     ]
-    with pytest.raises(ExistingFile, match="cameras found with masks of network=u2netp: choose"):
+    with pytest.raises(ExistingFile, match="cameras found with network=u2netp: choose"):
         task.capture(pictures, out, network="u2net")
     assert "s per photograph, about 10 s for 3" in caplog.text
     for v in range(3):
@@ -460,7 +458,7 @@ def test_a_turntable_without_anything_for_masks_is_one_line(steps, pictures, tmp
     monkeypatch.setattr("univoxel.capture.poses.poses", still)
     with pytest.raises(MissingExtra, match="needs rembg"):
         task.capture(pictures, tmp_path / "mug")
-    with pytest.raises(UserError, match=r"so cameras need masks: expected masks=rembg"):
+    with pytest.raises(UserError, match="so finding cameras needs masks: expected masks=rembg"):
         task.capture(pictures, tmp_path / "mug", masks="none")
 
 
@@ -468,11 +466,11 @@ def test_what_cannot_be_begun_leaves_nothing(steps, pictures, tmp_path, monkeypa
     out = tmp_path / "mug"
     cases: list[tuple[Path, dict[str, Any], type[Exception], str]] = [
         (tmp_path / "none", {}, DataError, "expected a folder of photographs or a video, got not"),
-        (pictures / "0.png", {}, DataError, "got a file of another kind"),
+        (pictures / "0.png", {}, DataError, "got another kind of file"),
         (pictures, {"masks": "nothing here"}, DataError, "masks: expected rembg, none or a folder"),
         (pictures, {"masks": "rembg"}, MissingExtra, "needs rembg"),
         (pictures, {"network": "u2"}, UserError, "network: expected one of u2netp, .*, got u2"),
-        (pictures, {"network": "u2net", "masks": "none"}, UserError, "network=u2net makes masks"),
+        (pictures, {"network": "u2net", "masks": "none"}, UserError, "network=u2net is used only"),
         (pictures, {"preset": "quick"}, UserError, "preset must be one of draft, fast, full, best"),
         (pictures, {"minutes": -1.0}, UserError, "minutes must be above 0"),
         (pictures, {"changes": ["colour=red"]}, UserError, "no field 'colour'"),

@@ -60,8 +60,8 @@ def test_a_build_without_embree(without_embree, capsys):
     assert "pip install" in found["Embree"].remedy
     assert main(["doctor"]) == 2
     said = capsys.readouterr()
-    assert "-> install a wheel that has it" in " ".join(said.out.split())
-    assert said.err.startswith("univoxel doctor: this installation cannot train: Embree: none")
+    assert "-> install a wheel with it" in " ".join(said.out.split())
+    assert said.err.startswith("univoxel doctor: this installation cannot train: Embree: missing")
 
 
 def test_no_build_at_all(monkeypatch):
@@ -72,7 +72,7 @@ def test_no_build_at_all(monkeypatch):
     assert status.reason == "no extension built under /here"
     finding = doctor.kernels(status)
     assert (finding.state, finding.found) == ("bad", "not loaded: no extension built under /here")
-    with pytest.raises(MissingNative, match=r"kernels: not loaded: .* Embree: none"):
+    with pytest.raises(MissingNative, match=r"kernels: not loaded: .* Embree: missing"):
         doctor.check([finding, doctor.embree(status)])
 
 

@@ -296,7 +296,7 @@ def broken_relit(folders):
             lambda f: (f.data / "envmaps" / "dim.hdr").write_bytes(b"#?"),
             r"dim\.hdr: expected a header",
         ),
-        (broken_truth, "truth of r_1 to have 16x16 pixels as in the test view, got 5x4"),
+        (broken_truth, "truth of r_1 with 16x16 pixels as in the test view, got 5x4"),
         (broken_relit, r"dim/r_0\.png: expected 16x16 pixels as in the test view, got 5x4"),
     ],
 )

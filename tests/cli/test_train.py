@@ -108,8 +108,8 @@ def test_grids_of_a_training_are_no_finer_than_its_photographs(data, tmp_path, m
 @pytest.mark.parametrize(
     ("masks", "wide", "said"),
     [
-        ("auto", True, "masks are 3 pixels too wide: they are taken in\n"),
-        ("given", True, "masks are 3 pixels too wide: see masks=auto\n"),
+        ("auto", True, "masks extend 3 pixels past the object's edge: they are eroded\n"),
+        ("given", True, "masks extend 3 pixels past the object's edge: masks=auto erodes them\n"),
         ("auto", False, None),
     ],
 )
@@ -139,7 +139,7 @@ def test_masks_that_are_too_wide_are_taken_in(tmp_path, monkeypatch, caplog, mas
     away = extract_mesh(load_scene(train(cfg))).vertices.norm(dim=1).mean()
     larger = 3 * 0.028 * (wide and masks == "given")
     assert away == pytest.approx(RADIUS + larger, abs=0.02)
-    assert said in caplog.text if said else "too wide" not in caplog.text
+    assert said in caplog.text if said else "past the object's edge" not in caplog.text
     assert trusted == [not (wide and masks == "auto")]
 
 
@@ -337,7 +337,7 @@ def test_a_limit_may_be_enough_for_the_steps_alone(caplog):
     photos = type("", (), {"cameras": cameras, "downscale": 1, "__len__": lambda self: 60})()
     task.announce(progress, photos)
     assert caplog.messages[-1].endswith(
-        "minutes=2 are enough for all steps if cameras and masks take 30 s"
+        "minutes=2 is enough for all steps if cameras and masks take 30 s"
     )
     assert clock.preparation == 30.0
 
@@ -351,7 +351,8 @@ def test_a_stage_without_a_step_is_said_and_ends_with_code_3(data, tmp_path, mon
     assert main(["train", str(data), *options]) == 3
     said = capsys.readouterr().out
     assert "the time limit was too short: of the planned steps it made 0% for" in said
-    assert "minutes 0.0001 are enough for about 0% of the steps, --minutes 1 for all" in said
+    wanted = "--minutes 0.0001 is enough for about 0% of the steps; --minutes 1 is enough for all"
+    assert wanted in said
     verdict = load_verdict(tmp_path / "run")
     assert verdict.empty
-    assert verdict.remedies[0] == "`--minutes 1`"
+    assert verdict.remedies[0] == "train with `--minutes 1`"
