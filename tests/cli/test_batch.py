@@ -154,7 +154,7 @@ def test_another_training_is_refused(night, scenes, capsys):
     out, options = night
     assert main(["batch", str(scenes[0]), "--out", str(out), *options, "--set=seed=4"]) == 2
     assert re.search(
-        r"ball\.json is of another changes: choose another --out", capsys.readouterr().err
+        r"ball\.json has another changes: choose another --out", capsys.readouterr().err
     )
 
 
@@ -299,12 +299,16 @@ def test_mistakes_are_found_before_anything_is_begun(scenes, tmp_path, monkeypat
         assert not (tmp_path / "out").exists()
 
     refused(UserError, "expected at least one scene", [])
-    refused(UserError, "nothing: expected a scene, got nothing there", [tmp_path / "nothing"])
+    refused(
+        UserError,
+        "nothing: expected a scene, but the folder does not exist",
+        [tmp_path / "nothing"],
+    )
     other = tmp_path / "b" / "ball"
     other.mkdir(parents=True)
     refused(UserError, "folders with different names, got .*ball and .*ball", [scenes[0], other])
     (tmp_path / "logs").mkdir()
-    refused(UserError, "logs: expected another name than 'logs'", [tmp_path / "logs"])
+    refused(UserError, "a scene cannot be named 'logs': rename the folder", [tmp_path / "logs"])
     for name in ("jobs", "threads", "tries"):
         refused(UserError, f"{name} must be at least 1, got 0", **{name: 0})
     for field, value, match in (
@@ -312,7 +316,7 @@ def test_mistakes_are_found_before_anything_is_begun(scenes, tmp_path, monkeypat
         ("steps", (), "steps must be among poses, masks, .*, got none"),
         ("steps", ("fly",), "steps must be among .*, got fly"),
         ("changes", ("seed=x",), "changes=seed=x: expected a int"),
-        ("config", tmp_path / "none.json", "got both: .*none.json says them"),
+        ("config", tmp_path / "none.json", "got both: .*none.json sets them"),
     ):
         refused(UserError, match, options=dataclasses.replace(OPTIONS, **{field: value}))
     refused(UserError, "expected jobs or scheduler, but not both", scheduler="tcp://x:1")

@@ -67,7 +67,7 @@ def test_photographs_become_a_mesh_and_a_page(captured):
     page = captured.page.read_text("utf-8")
     assert "(mug.glb)" in page
     assert "(cut/masks.html)" in page
-    assert "Made of " in page
+    assert "Made from " in page
     assert "novel views, PSNR" in page
     assert univoxel.open_run(captured.run).path == captured.run
 
@@ -299,7 +299,7 @@ def test_masks_of_ones_own_go_on(steps, pictures, tmp_path):
         ("train", (out / "cut").absolute(), False),
     ]
     page = (out / "index.html").read_text("utf-8")
-    assert "Made of 0.png and 2 others" in page
+    assert "Made from 0.png and 2 others" in page
     assert "31.25" in page
 
 
@@ -407,7 +407,7 @@ def test_a_turntable_gets_masks_first(steps, pictures, tmp_path, monkeypatch, ca
         ("cutout", out / "scene", out / "scene" / "masks"),
         ("train", (out / "cut").absolute(), False),
     ]
-    with pytest.raises(ExistingFile, match="cameras found with masks of network=u2netp: choose"):
+    with pytest.raises(ExistingFile, match="cameras found with network=u2netp: choose"):
         task.capture(pictures, out, network="u2net")
     assert "s per photograph, about 10 s for 3" in caplog.text
     for v in range(3):
@@ -458,7 +458,7 @@ def test_a_turntable_without_anything_for_masks_is_one_line(steps, pictures, tmp
     monkeypatch.setattr("univoxel.capture.poses.poses", still)
     with pytest.raises(MissingExtra, match="needs rembg"):
         task.capture(pictures, tmp_path / "mug")
-    with pytest.raises(UserError, match=r"so cameras need masks: expected masks=rembg"):
+    with pytest.raises(UserError, match="so finding cameras needs masks: expected masks=rembg"):
         task.capture(pictures, tmp_path / "mug", masks="none")
 
 
@@ -466,11 +466,11 @@ def test_what_cannot_be_begun_leaves_nothing(steps, pictures, tmp_path, monkeypa
     out = tmp_path / "mug"
     cases: list[tuple[Path, dict[str, Any], type[Exception], str]] = [
         (tmp_path / "none", {}, DataError, "expected a folder of photographs or a video, got not"),
-        (pictures / "0.png", {}, DataError, "got a file of another kind"),
+        (pictures / "0.png", {}, DataError, "got another kind of file"),
         (pictures, {"masks": "nothing here"}, DataError, "masks: expected rembg, none or a folder"),
         (pictures, {"masks": "rembg"}, MissingExtra, "needs rembg"),
         (pictures, {"network": "u2"}, UserError, "network: expected one of u2netp, .*, got u2"),
-        (pictures, {"network": "u2net", "masks": "none"}, UserError, "network=u2net makes masks"),
+        (pictures, {"network": "u2net", "masks": "none"}, UserError, "network=u2net is used only"),
         (pictures, {"preset": "quick"}, UserError, "preset must be one of draft, fast, full, best"),
         (pictures, {"minutes": -1.0}, UserError, "minutes must be above 0"),
         (pictures, {"changes": ["colour=red"]}, UserError, "no field 'colour'"),

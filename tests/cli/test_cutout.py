@@ -180,7 +180,9 @@ def test_without_a_network_there_is_one_line(tmp_path, with_masks, monkeypatch, 
     with pytest.raises(MissingExtra, match=r"pip install 'univoxel\[masks\]'.*--from FOLDER"):
         task.cutout(with_masks[0], out)
     assert main(["cutout", str(with_masks[0]), "--out", str(out)]) == 2
-    assert capsys.readouterr().err.startswith("univoxel cutout: masks from a network need rembg: ")
+    said = capsys.readouterr().err
+    assert said.startswith("univoxel cutout: making masks with a network needs rembg: ")
+    assert said.count("\n") == 1
     assert not out.exists()
 
 
@@ -203,7 +205,7 @@ def test_what_stands_out_in_depth(tmp_path, room, caplog):
     caplog.set_level("INFO", "univoxel")
     data, true = room
     cut = load_photos(task.cutout(data, tmp_path / "cut", "none"))
-    assert "masks from depth" in caplog.text
+    assert "masks: made from depth" in caplog.text
     agreed = [iou(cut.picture(view)[1], mask) for view, mask in enumerate(true)]
     assert np.mean(agreed) > 0.95
     assert min(agreed) > 0.93
@@ -226,8 +228,8 @@ def test_a_box_takes_the_table_out_of_all_masks(tmp_path, room, caplog):
     folder, box = write_masks(tmp_path / "masks", masks, photos.names), (-0.5, -0.5, 0.03)
     caplog.set_level("INFO", "univoxel")
     cut = load_photos(task.cutout(data, tmp_path / "cut", folder, box=(*box, 0.6, 0.5, 1.2)))
-    assert "the object is told by masks of 20 photographs, depth of " in caplog.text
-    assert "% of the surface, the box; it lies between " in caplog.text
+    assert "the object was found by masks of 20 photographs, depth of " in caplog.text
+    assert "% of the surface, the box; it spans " in caplog.text
     agreed = [iou(cut.picture(view)[1], mask) for view, mask in enumerate(true)]
     assert np.mean(agreed) > 0.9
     assert min(agreed) > 0.85
@@ -248,10 +250,13 @@ def test_in_depth_a_box_ends_the_table_that_is_kept(tmp_path, room):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--box", "0", "0", "0", "1", "1", "0"], "--box: expected X0 Y0 Z0 X1 Y1 Z1, each"),
+        (["--box", "0", "0", "0", "1", "1", "0"], "--box: expected X0 Y0 Z0 X1 Y1 Z1, with each"),
         (["--box", "0", "0", "0", "1"], "--box"),
-        (["--keep-table", "--from", "none"], "--keep-table: expected masks from none, depth"),
-        (["--from", "none", "--network", "u2net"], "--network u2net makes masks where none are"),
+        (["--keep-table", "--from", "none"], "--keep-table needs masks from depth (none)"),
+        (
+            ["--from", "none", "--network", "u2net"],
+            "--network u2net is used only if masks are made",
+        ),
         (["--network", "u2"], "Expected one of ('u2netp', 'silueta'"),
     ],
 )
@@ -262,6 +267,6 @@ def test_options_of_masks_that_cannot_be(tmp_path, capsys, options, said):
 
 def test_where_nothing_stands_out_the_way_out_is_told(tmp_path, with_masks):
     """Smooth balls before nothing have no depth that could be found."""
-    with pytest.raises(DataError, match="expected source=rembg or a folder of masks, got none"):
+    with pytest.raises(DataError, match="use source=rembg or a folder of masks instead of none"):
         task.cutout(with_masks[0], tmp_path / "cut", "none")
     assert not (tmp_path / "cut").exists()

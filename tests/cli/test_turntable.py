@@ -189,7 +189,8 @@ def test_light_is_white_where_photographs_do_not_tell():
 def test_solve_finds_map_and_albedo_under_light_that_turns(photographs):
     scene = turning(sphere_scene(NODES))
     cfg = JointConfig(points=800, newton_points=800, rays=512, tracing=1, rounds=3)
-    joint_solve.solve(scene, photographs["turning"], cfg, 0, Steps(300))
+    # The trials leave a map 1.5 times too bright for grey materials: 300 steps are too few
+    joint_solve.solve(scene, photographs["turning"], cfg, 0, Steps(cfg.iterations))
     mesh = extract_mesh(scene)
     x = mesh.vertices[:, 0]
     ratio = torch.stack([mesh.albedo[x > 0.1].mean(0) / RED, mesh.albedo[x < -0.1].mean(0) / BLUE])
@@ -243,7 +244,10 @@ def test_a_checkpoint_keeps_the_axes(laid, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"light": EnvmapConfig()}, "needs hybrid or a local light, sg, sh or mlp, got envmap"),
+        (
+            {"light": EnvmapConfig()},
+            r"needs hybrid or a local .* model \(sg, sh or mlp\), got envmap",
+        ),
         ({"varying": "light"}, "cannot vary as well"),
     ],
 )
