@@ -154,7 +154,7 @@ def test_another_training_is_refused(night, scenes, capsys):
     out, options = night
     assert main(["batch", str(scenes[0]), "--out", str(out), *options, "--set=seed=4"]) == 2
     assert re.search(
-        r"ball\.json has another changes: choose another --out", capsys.readouterr().err
+        r"ball\.json was written for other changes: choose another --out", capsys.readouterr().err
     )
 
 
@@ -316,7 +316,7 @@ def test_mistakes_are_found_before_anything_is_begun(scenes, tmp_path, monkeypat
         ("steps", (), "steps must be among poses, masks, .*, got none"),
         ("steps", ("fly",), "steps must be among .*, got fly"),
         ("changes", ("seed=x",), "changes=seed=x: expected a int"),
-        ("config", tmp_path / "none.json", "got both: .*none.json sets them"),
+        ("config", tmp_path / "none.json", "config cannot be combined with preset or light: .*none.json sets both"),
     ):
         refused(UserError, match, options=dataclasses.replace(OPTIONS, **{field: value}))
     refused(UserError, "expected jobs or scheduler, but not both", scheduler="tcp://x:1")

@@ -128,7 +128,7 @@ def test_other_photographs_are_refused(captured, photographs, tmp_path):
     for folder, why in (
         (more, "IMG_99.jpg is new"),
         (fewer, "IMG_03.jpg is missing"),
-        (other, "IMG_04.jpg is another file now"),
+        (other, "IMG_04.jpg has changed"),
     ):
         with pytest.raises(ExistingFile, match=f"holds a capture of IMG_00.jpg and 10 .*{why}"):
             capturing.make((folder, masks), out)
@@ -407,9 +407,9 @@ def test_a_turntable_gets_masks_first(steps, pictures, tmp_path, monkeypatch, ca
         ("cutout", out / "scene", out / "scene" / "masks"),
         ("train", (out / "cut").absolute(), False),
     ]
-    with pytest.raises(ExistingFile, match="cameras found with network=u2netp: choose"):
+    with pytest.raises(ExistingFile, match="cameras found with masks of network=u2netp: choose"):
         task.capture(pictures, out, network="u2net")
-    assert "s per photograph, about 10 s for 3" in caplog.text
+    assert "s per photograph, about 10 s for all 3" in caplog.text
     for v in range(3):
         mask = np.asarray(Image.open(out / "masks" / f"{v}.png"))
         assert (mask == np.asarray(Image.open(pictures / f"{v}.png"))[..., 0]).all()
@@ -470,7 +470,7 @@ def test_what_cannot_be_begun_leaves_nothing(steps, pictures, tmp_path, monkeypa
         (pictures, {"masks": "nothing here"}, DataError, "masks: expected rembg, none or a folder"),
         (pictures, {"masks": "rembg"}, MissingExtra, "needs rembg"),
         (pictures, {"network": "u2"}, UserError, "network: expected one of u2netp, .*, got u2"),
-        (pictures, {"network": "u2net", "masks": "none"}, UserError, "network=u2net is used only"),
+        (pictures, {"network": "u2net", "masks": "none"}, UserError, "network=u2net has no effect unless"),
         (pictures, {"preset": "quick"}, UserError, "preset must be one of draft, fast, full, best"),
         (pictures, {"minutes": -1.0}, UserError, "minutes must be above 0"),
         (pictures, {"changes": ["colour=red"]}, UserError, "no field 'colour'"),
@@ -512,4 +512,4 @@ def test_how_long_training_takes_is_said_before_cameras_are_found(
     monkeypatch.setattr(task, "_find_cameras", stop)
     with pytest.raises(DataError, match="no cameras"):
         task.capture(photographs[0], tmp_path / "out", masks=photographs[1], preset="draft")
-    assert re.search(r"training takes about \d+ (s|min) on this machine; cameras", caplog.text)
+    assert re.search(r"training takes about \d+ (s|min) on this machine, in addition to the time for cameras", caplog.text)

@@ -228,8 +228,8 @@ def test_a_box_takes_the_table_out_of_all_masks(tmp_path, room, caplog):
     folder, box = write_masks(tmp_path / "masks", masks, photos.names), (-0.5, -0.5, 0.03)
     caplog.set_level("INFO", "univoxel")
     cut = load_photos(task.cutout(data, tmp_path / "cut", folder, box=(*box, 0.6, 0.5, 1.2)))
-    assert "the object was found by masks of 20 photographs, depth of " in caplog.text
-    assert "% of the surface, the box; it spans " in caplog.text
+    assert "the object was found by masks of 20 photographs, depth on " in caplog.text
+    assert "% of its surface, the box; it extends from " in caplog.text
     agreed = [iou(cut.picture(view)[1], mask) for view, mask in enumerate(true)]
     assert np.mean(agreed) > 0.9
     assert min(agreed) > 0.85
@@ -250,12 +250,12 @@ def test_in_depth_a_box_ends_the_table_that_is_kept(tmp_path, room):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--box", "0", "0", "0", "1", "1", "0"], "--box: expected X0 Y0 Z0 X1 Y1 Z1, with each"),
+        (["--box", "0", "0", "0", "1", "1", "0"], "--box: expected X0 Y0 Z0 X1 Y1 Z1 with X0 < X1"),
         (["--box", "0", "0", "0", "1"], "--box"),
         (["--keep-table", "--from", "none"], "--keep-table needs masks from depth (none)"),
         (
             ["--from", "none", "--network", "u2net"],
-            "--network u2net is used only if masks are made",
+            "--network u2net has no effect unless a network makes the masks",
         ),
         (["--network", "u2"], "Expected one of ('u2netp', 'silueta'"),
     ],

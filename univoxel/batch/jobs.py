@@ -96,7 +96,7 @@ class Job:
         before = self.record()["identity"]
         other = [key for key, value in self.identity.items() if before and before.get(key) != value]
         if other:
-            where = f"{self.name}: {self.file('.json')} is of another {' and '.join(other)}"
+            where = f"{self.name}: {self.file('.json')} was written for other {' and '.join(other)}"
             hint = "choose another out, or remove that file and the folder of its results"
             raise ExistingFile(f"{where}: {hint}", "out")
 
