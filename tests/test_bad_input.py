@@ -120,7 +120,7 @@ def test_a_run_that_was_killed_before_its_first_checkpoint(run, data, capsys):
     (run / FILE).unlink()
     (run / "log.jsonl").write_text("gone\n")
     assert main(["train", str(data), "--out", str(run), "--resume", *OPTIONS]) == 0
-    assert f"{run}: nothing was saved yet" in capsys.readouterr().out
+    assert f"{run}: nothing has been saved yet" in capsys.readouterr().out
     assert (run / FILE).is_file()
     assert "gone" not in ((run / "log.jsonl").read_text() if (run / "log.jsonl").exists() else "")
 

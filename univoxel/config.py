@@ -191,7 +191,7 @@ class TrainConfig:
     )
     carving_seconds: float = setting(
         12.0,
-        "maximum expected time for carving concavities on two cores; skipped if the light varies",
+        "carve concavities only if this is expected to suffice on two cores; never if light varies",
         unit="seconds",
         least=0,
     )

@@ -470,7 +470,12 @@ def test_what_cannot_be_begun_leaves_nothing(steps, pictures, tmp_path, monkeypa
         (pictures, {"masks": "nothing here"}, DataError, "masks: expected rembg, none or a folder"),
         (pictures, {"masks": "rembg"}, MissingExtra, "needs rembg"),
         (pictures, {"network": "u2"}, UserError, "network: expected one of u2netp, .*, got u2"),
-        (pictures, {"network": "u2net", "masks": "none"}, UserError, "network=u2net has no effect unless"),
+        (
+            pictures,
+            {"network": "u2net", "masks": "none"},
+            UserError,
+            "network=u2net has no effect unless",
+        ),
         (pictures, {"preset": "quick"}, UserError, "preset must be one of draft, fast, full, best"),
         (pictures, {"minutes": -1.0}, UserError, "minutes must be above 0"),
         (pictures, {"changes": ["colour=red"]}, UserError, "no field 'colour'"),
@@ -512,4 +517,7 @@ def test_how_long_training_takes_is_said_before_cameras_are_found(
     monkeypatch.setattr(task, "_find_cameras", stop)
     with pytest.raises(DataError, match="no cameras"):
         task.capture(photographs[0], tmp_path / "out", masks=photographs[1], preset="draft")
-    assert re.search(r"training takes about \d+ (s|min) on this machine, in addition to the time for cameras", caplog.text)
+    assert re.search(
+        r"training takes about \d+ (s|min) on this machine, in addition to the time for cameras",
+        caplog.text,
+    )

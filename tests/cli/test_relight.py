@@ -201,7 +201,7 @@ def test_test_views_come_from_the_data_of_the_run(run):
         ({"animation": ["avi"]}, ValueError, "animation must be gif or mp4, got 'avi'"),
         ({"cameras": "orbit 2", "elevation": 90.0}, ValueError, r"elevation must be in \(-90, 90"),
         ({"cameras": "orbit many"}, ValueError, "expected orbit, or orbit N"),
-        ({"cameras": "nowhere.json"}, DataError, r"nowhere\.json: expected a file of cameras"),
+        ({"cameras": "nowhere.json"}, DataError, r"nowhere\.json: expected a camera file"),
     ],
 )
 def test_bad_arguments(run, options, error, message):

@@ -528,7 +528,7 @@ def test_what_is_no_png(tmp_path, image, message):
     "channels", [{}, {"Y": np.zeros((2, 2)), "Z": np.zeros((2, 3))}, {"Y": np.zeros((0, 2))}]
 )
 def test_what_is_no_exr(tmp_path, channels):
-    with pytest.raises(ValueError, match=r"channels must be \[H, W\] of one size"):
+    with pytest.raises(ValueError, match=r"channels must all be \[H, W\]"):
         images.write_exr(tmp_path / "a.exr", channels)
     assert not list(tmp_path.iterdir())
 

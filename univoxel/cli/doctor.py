@@ -113,7 +113,7 @@ def openmp(runtimes: Sequence[str]) -> Finding:
     found = ", ".join(runtimes) or "none"
     if len(runtimes) <= 1:
         return Finding("OpenMP", found)
-    remedy = "several slow each other down: import univoxel before packages that load another"
+    remedy = "several OpenMP runtimes slow each other down: import univoxel first"
     return Finding("OpenMP", found, "look", remedy)
 
 

@@ -232,7 +232,7 @@ def resumed(cfg: config.TrainConfig) -> tuple[Scene, dict[str, Any]] | None:
         UserError: the checkpoint cannot be read, or it belongs to another configuration.
     """
     if not (cfg.out / FILE).is_file():
-        log.info(f"{cfg.out}: nothing was saved yet, so the training starts from the beginning")
+        log.info(f"{cfg.out}: nothing has been saved yet, so training starts from the beginning")
         return None
     scene, state = load_checkpoint(cfg.out)
     config.check_same(cfg)

@@ -409,7 +409,7 @@ def write_exr(
     shapes = {array.shape for array in arrays.values()}
     if len(shapes) != 1 or len(shape := shapes.pop()) != 2 or 0 in shape:
         got = {name: list(array.shape) for name, array in arrays.items()}
-        raise ValueError(f"write_exr: channels must be [H, W] of one size, got {got}")
+        raise ValueError(f"write_exr: channels must all be [H, W] and of the same size, got {got}")
     if half:
         arrays = {name: array.clip(-HALF_MAX, HALF_MAX) for name, array in arrays.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
