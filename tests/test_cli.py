@@ -532,7 +532,7 @@ def test_without_a_clone_there_is_no_laboratory(calls, monkeypatch, tmp_path, ca
     monkeypatch.setattr(cli, "CLONE", tmp_path)
     assert main(arguments) == 2
     out, err = capsys.readouterr()
-    assert err.startswith("univoxel: compare, chart, stress, bank, submit run experiments, which")
+    assert err.startswith("univoxel: compare, chart, stress, bank, submit, published run ")
     assert err.count("\n") == 1
     assert not out
     assert main(["completion", "bash"]) == 0

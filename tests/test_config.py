@@ -226,7 +226,7 @@ def without_newer_fields(content):
         (without_newer_fields, ""),
         (lambda c: c["stages"][2].update(tracing=7), "the run was started with another stages"),
         (lambda c: c.update(stages=c["stages"][:3]), "the run was started with another stages"),
-        (lambda c: [c], "config.json: expected an object"),
+        (lambda c: [c], "config.json: expected a JSON object"),
     ],
 )
 def test_a_run_goes_on_under_its_own_stages_alone(tmp_path, cut, refusal):

@@ -87,7 +87,9 @@ def test_a_mean_is_over_all_scenes_or_left_out(disk, trained, tmp_path):
     path = module.published(disk / "s4r", tmp_path / "out")
     assert "(published: of 4) | 25.00 | 0.9500 | 25.00 | 0.0100 | - |" in path.read_text()
     trained[1]["chair"] = Outcome("chair", "fast", {}, error="it | broke")
-    with pytest.raises(ProcessFailed, match=r"1 of 2 trainings failed, .*broke; the tables: .*md"):
+    with pytest.raises(
+        ProcessFailed, match=r"1 of 2 training runs failed; .*broke; the tables: .*md"
+    ):
         module.published(disk / "s4r", tmp_path / "out")
     assert "| chair | failed: it / broke |" in path.read_text()
     assert "(published: of 4) | - | - | - | - | - |" in path.read_text()

@@ -140,7 +140,7 @@ def test_compare_takes_maps_of_two_sizes(run):
 def test_a_run_without_a_map(tmp_path):
     save_scene(sphere_scene(0), tmp_path, {})
     with pytest.raises(
-        ValueError, match=r"has no environment map: it was trained with local light \(sg\)"
+        ValueError, match=r"has no environment map, because it was trained with local light \(sg\)"
     ):
         envmap(tmp_path, tmp_path / "map.exr")
     assert not (tmp_path / "map.exr").exists()

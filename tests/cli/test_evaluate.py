@@ -290,7 +290,10 @@ def broken_relit(folders):
     ("change", "message"),
     [
         (lambda f: (f.run / "config.json").unlink(), r"folder of a run, but it has no"),
-        (lambda f: (f.run / "config.json").write_text("{}"), "config.json: expected data, a"),
+        (
+            lambda f: (f.run / "config.json").write_text("{}"),
+            "config.json: expected data, the name of a folder",
+        ),
         (lambda f: (f.run / "config.json").write_text("{"), "config.json: .* JSON"),
         (
             lambda f: (f.data / "envmaps" / "dim.hdr").write_bytes(b"#?"),

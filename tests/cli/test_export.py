@@ -251,7 +251,11 @@ def test_what_the_box_cuts_is_closed(tmp_path, monkeypatch):
         ),
         ("a.glb", {"lods": -1}, "lods must be 0 to 8, got -1"),
         ("a.glb", {"lods": 9}, "lods must be 0 to 8, got 9"),
-        ("a.glb", {"lods": 3, "faces": 2000}, "lods=3 with 2000 faces leaves 31 in the coarsest"),
+        (
+            "a.glb",
+            {"lods": 3, "faces": 2000},
+            "lods=3 with 2000 faces leaves 31 faces in the coarsest",
+        ),
     ],
 )
 def test_bad_arguments(tmp_path, name, options, message):

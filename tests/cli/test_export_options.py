@@ -189,7 +189,7 @@ def test_levels_of_other_files(export, tmp_path):
 def test_levels_need_triangles(export, monkeypatch, tmp_path):
     """Of the surface itself, too, where it has fewer than were allowed."""
     with pytest.raises(
-        UserError, match=r"lods=8 with \d+ faces leaves 0 in the coarsest"
+        UserError, match=r"lods=8 with \d+ faces leaves 0 faces in the coarsest"
     ) as caught:
         export("a.ply", faces=None, lods=8)
     assert caught.value.arguments == ("lods",)

@@ -179,7 +179,7 @@ def test_cameras_on_their_side_do_not_say_what_is_up(tmp_path):
 @pytest.mark.parametrize("writer", [write_colmap, write_nerfstudio, write_llff])
 def test_splits_that_cannot_be_made(tmp_path, writer):
     writer(tmp_path / "one", scene(views=1))
-    with pytest.raises(DataError, match="one: expected at least two photographs, got 1"):
+    with pytest.raises(DataError, match="one: expected at least two photographs, found 1"):
         load_photos(tmp_path / "one")
     writer(tmp_path / "two", scene(views=2))
     with pytest.raises(DataError, match="two: expected split train or test, got val"):

@@ -58,7 +58,7 @@ def test_the_light_of_a_view_is_shown(view, index):
 
 @pytest.mark.parametrize("view", ["3", "below", "-1"])
 def test_no_such_view(view):
-    wanted = f"light_of: expected a number below 3 or one of left to above, got '{view}'"
+    wanted = f"light_of: expected a number below 3 or a name from left to above, got '{view}'"
     with pytest.raises(ValueError, match=wanted):
         shaken().choose(view)
 

@@ -110,7 +110,7 @@ def test_it_asks_for_the_sector_that_was_not_photographed(run, text):
 
 
 def test_photographs_stand_beside_their_render_the_worst_first(run, text):
-    found = [p for alt, p in pictures(section(text, "Photographs and render")) if alt]
+    found = [p for alt, p in pictures(section(text, "Photographs and renders")) if alt]
     assert len(found) == 3 * 4
     split = report_pictures.Split(photos_of(2, 32), False)
     views, count = report_pictures.worst(run.scene, [split], 2, 16)
@@ -308,7 +308,7 @@ def test_by_the_command_line(run, capfd, tmp_path):
     assert Path(out.splitlines()[-1]) == run.path / "report.html"
     text = (run.path / "report.html").read_text()
     assert "<h1>One</h1>" in text
-    assert len(pictures(section(text, "Photographs and render"))) == 3
+    assert len(pictures(section(text, "Photographs and renders"))) == 3
     for arguments, message in (
         ([str(tmp_path)], f"{tmp_path}: not a trained run"),
         ([str(run.path), "--views", "-1"], "--views must be at least 0, got -1"),

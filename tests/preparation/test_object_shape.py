@@ -62,7 +62,9 @@ def test_masks_outvote_those_that_are_wrong(fake):
 
 def test_boxes_that_are_none_or_hold_nothing():
     for values in ((0, 0, 0, 1, 1), (0, 0, 0, 1, 1, 0), (0, 0, 0, 1, 1, math.nan)):
-        with pytest.raises(UserError, match=r"box: expected X0 Y0 Z0 X1 Y1 Z1, .*, got 0 0 0 1 1"):
+        with pytest.raises(
+            UserError, match=r"box: expected X0 Y0 Z0 X1 Y1 Z1 with .*, got 0 0 0 1 1"
+        ):
             box_corners(values)
     cameras = cameras_around(12, 32)
     masks, box = [true_mask(cameras, v) for v in range(12)], box_corners((1, 1, 1, 1.2, 1.2, 1.2))
@@ -86,7 +88,7 @@ def test_pixels_that_see_a_box():
 
 def test_masks_that_show_nothing():
     cameras = cameras_around(12, 32)
-    with pytest.raises(UserError, match="do not overlap"):
+    with pytest.raises(UserError, match="overlap in no part"):
         find_object([torch.zeros(32, 32)] * 12, without_depth(cameras), VOXELS)
 
 

@@ -69,7 +69,7 @@ def test_a_sun_is_found(share):
     scene, problem, albedo = painted(map)
     sun = albedo_entropy.fit_sun_(scene, problem, no_metal(problem))
     assert sun is not None
-    assert str(sun).endswith(f"sends {share:.0%} of the light")
+    assert str(sun).endswith(f"gives {share:.0%} of the light")
     azimuth, elevation = (math.radians(int(x)) for x in re.findall(r"-?\d+", str(sun))[:2])
     across = math.cos(elevation)
     told = across * math.cos(azimuth), across * math.sin(azimuth), math.sin(elevation)

@@ -50,7 +50,7 @@ class BatchOptions:
     samples: Annotated[int, parsing.ADVANCED] = choices.SAMPLES
     """light samples per pixel of relit test images"""
     jobs: Annotated[int | None, parsing.written("N", "as cores and memory allow")] = None
-    """number of scenes at a time; each uses --threads threads, or its share of the cores"""
+    """number of scenes at a time; each uses --threads threads or its share of cores"""
     scheduler: parsing.Scheduler = None
     """Dask scheduler to use; anyone who can reach it can run code on its workers"""
     tries: Annotated[int, parsing.ADVANCED] = 3

@@ -54,7 +54,7 @@ class CaptureOptions:
     preset: choices.PresetOrAuto = "auto"
     """amount of work, from draft to best; auto: chosen to fit --minutes, else fast"""
     light: Annotated[choices.LightName, ADVANCED] = "hybrid"
-    """lighting model; hybrid best keeps shadows out of the albedo, others are to compare"""
+    """lighting model; hybrid keeps shadows out of the albedo, others are to compare"""
     minutes: Minutes = None
     """time limit of the training; finding cameras and making masks takes extra time"""
     changes: Changes = ()

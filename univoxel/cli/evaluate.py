@@ -49,7 +49,7 @@ class EvaluateOptions:
     """fit the light to each test photograph before measuring, as many papers do"""
 
     full_size: bool = False
-    """also measure novel views at full size, with the texture that train or detail added"""
+    """also measure novel views at full size, with the texture of train or detail"""
 
     def __post_init__(self) -> None:
         if self.samples < 1 or self.bounces < 0:

@@ -30,7 +30,7 @@ class TrainOptions:
     preset: choices.PresetOrAuto = "auto"
     """amount of work, from draft to best; auto: chosen to fit --minutes, else fast"""
     light: Annotated[choices.LightName, parsing.ADVANCED] = "hybrid"
-    """lighting model; hybrid best keeps shadows out of the albedo, others are to compare"""
+    """lighting model; hybrid keeps shadows out of the albedo, others are to compare"""
     varying: Annotated[choices.Differing, parsing.ADVANCED] = "auto"
     """what changes between photographs; auto: exposure, if a change is detected"""
     light_frame: Annotated[choices.LightFrameOrAuto, parsing.ADVANCED] = "auto"
