@@ -250,7 +250,7 @@ def test_an_exr_of_several_parts(tmp_path):
     OpenEXR.File(parts[:2]).write(str(tmp_path / "a.exr"))
     assert sorted(images.read_exr(tmp_path / "a.exr")) == ["B", "G", "R"]
     OpenEXR.File(parts).write(str(tmp_path / "a.exr"))
-    with pytest.raises(DataError, match="got several parts with colours .depth, beauty, diffuse"):
+    with pytest.raises(DataError, match="got several parts with colours"):
         images.read_image(tmp_path / "a.exr")
 
 

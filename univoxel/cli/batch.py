@@ -40,7 +40,7 @@ class BatchOptions:
     preset: choices.PresetOrAuto = "auto"
     """amount of work, from draft to best; auto: chosen to fit --minutes, else fast"""
     light: Annotated[choices.LightName, parsing.ADVANCED] = "hybrid"
-    """lighting model; hybrid best keeps shadows out of the albedo, others are to compare"""
+    """lighting model; hybrid keeps shadows out of the albedo, others are to compare"""
     minutes: parsing.Minutes = None
     """time limit of each training"""
     config: parsing.ConfigFile = None
