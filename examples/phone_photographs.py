@@ -229,6 +229,7 @@ def main() -> None:
         if options.masks:
             mask = mine.reshape(height, 2, width, 2).float().mean((1, 3)).numpy()
             Image.fromarray((255 * mask + 0.5).astype(np.uint8)).save(options.masks / f"{name}.png")
+        print(f"photograph {view + 1} of {options.first or options.photographs}", flush=True)
     print(f"{view + 1} photographs of {width}x{height} in {options.out}")
 
 
