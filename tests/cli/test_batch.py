@@ -87,7 +87,7 @@ def in_mid_training(out: Path, name: str) -> bool:
 
 def went_on(out: Path, name: str) -> bool:
     """Whether a later process began with what an earlier one had saved."""
-    return said(out, name).count("nothing was saved") == 1 < trainings(out, name)
+    return said(out, name).count("nothing has been saved") == 1 < trainings(out, name)
 
 
 def whole(out: Path, name: str) -> bool:
