@@ -1,4 +1,4 @@
-"""Draws the diagrams of docs/method: stages, joint solve, carving, fields, layers.
+"""Draws the diagrams of docs/method: stages, joint optimisation, carving, fields, layers.
 
     python docs/figures/diagrams.py docs/images
 
@@ -112,7 +112,7 @@ def stages() -> Figure:
     axes.text(
         4.7,
         0.14,
-        "held-out rays decide on capacity",
+        "validation pixels set the size",
         ha="center",
         color=RED,
         size=8,
@@ -122,7 +122,7 @@ def stages() -> Figure:
 
 
 def joint_solve() -> Figure:
-    """The order of the joint solve."""
+    """The order of the joint optimisation."""
     figure, axes = blank(9.0, 3.3)
     box(
         axes,
@@ -138,7 +138,7 @@ def joint_solve() -> Figure:
         axes,
         (2.35, 1.9),
         (1.75, 1.1),
-        "trials",
+        "multi-start",
         "hypotheses on metal",
         "unused observations",
         "decide",
@@ -170,7 +170,7 @@ def joint_solve() -> Figure:
         axes,
         (4.95, 0.3),
         (1.75, 0.95),
-        "metal decision",
+        "metal classes",
         "two fits a point;",
         "labels for the head",
         color=BLUE,

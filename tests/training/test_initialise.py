@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ from observed_points import lamps, no_metal, sphere_of
 
 from univoxel.config import JointConfig
 from univoxel.lights.views import ViewLights
+from univoxel.render.observations import first_labels
 from univoxel.training import metals as initialise
 from univoxel.training.metals import (
     ONLY_METAL_ALBEDO,
@@ -105,6 +107,19 @@ def test_half_of_the_observations_are_fitted_and_the_others_judge(monkeypatch):
             == whole.view[slice(*whole.offsets[point : point + 2])].tolist()
         )
         assert len(fitted.view) == len(fitted.color) == len(fitted.wo)
+
+
+@pytest.mark.parametrize(("share", "likely"), [(0.0, False), (0.1, False), (0.2, True)])
+def test_metal_is_likely_if_the_stages_before_saw_some(share, likely):
+    """That is what the joint stage takes over from them, with their labels."""
+    _, problem = sphere_of((0.5, 0.3, 0.2), 0.0, 0.4)
+    metallic = 0.5 * some_metal(problem, share).metal.float()
+    before = SimpleNamespace(
+        field=SimpleNamespace(features_at=lambda _: None), material=lambda _: (0, 0, metallic)
+    )
+    labels = first_labels(before, problem, CFG)
+    assert torch.equal(labels.metal, metallic > 0)
+    assert labels.likely == likely
 
 
 def test_rounds_that_solve_nothing_change_nothing(monkeypatch):

@@ -161,13 +161,13 @@ def _train(
 def ready(
     photos: Photos, cfg: config.TrainConfig, begun: Scene | None, progress: Progress
 ) -> tuple[Scene, PinnedHull | None, TrainingPixels, config.TrainConfig, tuple[Tensor, Tensor]]:
-    """What the stages train on: the scene, the pinned hull, the pixels, the configuration within
-    the limits that they set, and the box.
+    """What the stages train on: the scene, the frozen hull, the pixels, the configuration with its
+    grids limited to what the pixels resolve, and the box.
 
     The distances to silhouettes, four bytes a pixel, are freed when it returns.
 
     Args:
-        begun: the scene of a run that goes on.
+        begun: the scene of a run that continues.
     """
     silhouettes = find_silhouettes(photos, cfg, progress.preparing)
     shown = silhouettes.photos, silhouettes.distance, silhouettes.doubted

@@ -155,7 +155,7 @@ def fitted(constant: Tensor, slope: Tensor, target: Tensor, min_brightest: float
     return CAUCHY**2 * torch.log1p(linearised()[1]).mean((1, 2)) + 1e-6
 
 
-# Where the joint optimisation starts from: roughness and metal under no map yet, by trial.
+# Where the joint optimisation starts from: what is metal, under no map yet, by trial.
 
 
 # Points of a round. Of a third of them residuals scatter more than they differ
