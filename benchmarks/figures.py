@@ -61,8 +61,8 @@ FIGURES = [
     ),
     Figure(
         "chart",
-        30,
-        (f"univoxel lab chart {ALL} --out {{work}}/chart --only draft fast full",),
+        90,
+        (f"univoxel lab chart {ALL} --out {{work}}/chart --only draft fast full --seeds 3",),
         "chart/chart",
     ),
     script("threads", 8, "{sneaker} --preset fast --out {work}/threads.json"),

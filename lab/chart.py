@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from lab import plots, runner
@@ -24,7 +25,7 @@ QUICK = ("voxels-x0.5", "rays-x0.5", "light-sg", "light-baked")  # beside draft 
 
 @dataclass(frozen=True)
 class Published:
-    """A figure from a paper: another data set, a GPU. Drawn to compare orders, not digits."""
+    """A figure from a paper: another data set, a GPU. The pages show them beside ours."""
 
     name: str
     where: str  # data and machine
@@ -58,6 +59,7 @@ def chart(
     only: Sequence[str] = (),
     changes: Sequence[str] = (),
     samples: int = 64,
+    seeds: int = 1,
     jobs: int = 1,
     scheduler: str | None = None,
 ) -> Path:
@@ -72,6 +74,7 @@ def chart(
         only: names of settings; empty: all.
         changes: FIELD=VALUE of the configuration, for all training runs.
         samples: light samples per pixel of relit images.
+        seeds: training runs per scene and setting, >= 1; files and figure show their medians.
         jobs, scheduler: number of runs at a time, or a Dask scheduler; see runner.run_pairs.
 
     Returns:
@@ -88,25 +91,61 @@ def chart(
     wanted = only or ((*dict.fromkeys(("draft", preset)), *QUICK) if quick else tuple(chosen))
     if unknown := [name for name in wanted if name not in chosen]:
         raise UserError(f"only must be among {', '.join(chosen)}, got {', '.join(unknown)}", "only")
-    outcomes = runner.run(
-        scenes, [chosen[name] for name in wanted], out, samples, at_once=jobs, scheduler=scheduler
-    )
+    if seeds < 1:
+        raise UserError(f"seeds must be at least 1, got {seeds}", "seeds")
+    trained = [seeded(chosen[name], seed) for name in wanted for seed in range(seeds)]
+    runs = runner.run(scenes, trained, out, samples, at_once=jobs, scheduler=scheduler)
+    groups = [runs[k : k + seeds] for k in range(0, len(runs), seeds)]
+    outcomes = [median_of(group) for group in groups]
     record = {
         "preset": preset,
         "light": light,
         "changes": list(changes),
         "samples": samples,
         "machine": plots.machine(),
-        "points": [outcome.summary() for outcome in outcomes],
+        "seeds": seeds,
+        "points": [
+            outcome.summary() | {"ranges": ranges(group)}
+            for outcome, group in zip(outcomes, groups, strict=True)
+        ],
         "fronts": fronts(outcomes),
         "published": [asdict(point) for point in PUBLISHED],
     }
     write_text(out / "chart.json", result_text(record))
     if any(not outcome.error for outcome in outcomes):
         plot(outcomes, out / "chart")
-    if failed := runner.failures(outcomes):
+    if failed := runner.failures(runs):
         raise ProcessFailed(failed)
     return out / "chart.png"
+
+
+def seeded(setting: Setting, seed: int) -> Setting:
+    """The setting with a random seed; 0 is that of the presets."""
+    if not seed:
+        return setting
+    name, changes = f"{setting.name}-s{seed}", (*setting.changes, f"seed={seed}")
+    return replace(setting, name=name, changes=changes)
+
+
+def median_of(runs: Sequence[Outcome]) -> Outcome:
+    """The outcome of a setting: the median of each measure over its seeds. It has the log of the
+    first, and is a failure if one of them is, because half of the seeds would flatter."""
+    failed = [run.error for run in runs if run.error]
+    if failed:
+        return replace(runs[0], measures={}, error=failed[0])
+    values = _by_measure(runs)
+    return replace(runs[0], measures={key: median(found) for key, found in values.items()})
+
+
+def ranges(runs: Sequence[Outcome]) -> dict[str, float]:
+    """By measure, how far the seeds of a setting lie apart."""
+    return {key: max(found) - min(found) for key, found in _by_measure(runs).items()}
+
+
+def _by_measure(runs: Sequence[Outcome]) -> dict[str, list[float]]:
+    """The measures that every run has."""
+    keys = [key for key in runs[0].measures if all(r.measures.get(key) is not None for r in runs)]
+    return {key: [float(run.measures[key] or 0) for run in runs] for key in keys}
 
 
 def settings(preset: str, light: LightName, changes: tuple[str, ...] = ()) -> dict[str, Setting]:
@@ -168,8 +207,7 @@ def plot(outcomes: Sequence[Outcome], stem: Path) -> list[Path]:
     made = plots.machine()
     legend = ", ".join(f"{mark} {name}" for name, mark in marks.items() if name != mark)
     figure.suptitle(
-        f"{made['threads']} threads of {made['processor']}. Line: Pareto front. Grey: published "
-        f"results on other data and on GPUs.\n{legend}",
+        f"{made['threads']} threads of {made['processor']}. Line: Pareto front.\n{legend}",
         size=9,
         wrap=True,
     )
@@ -203,16 +241,7 @@ def _draw_measure(
             else 1
         )
         axis.plot(*point, "os^"[kind], color=plots.color(kind), markersize=8 - 3 * (kind > 0))
-        _label(axis, marks[name], point, "black", 8)
-    for p in PUBLISHED:
-        if (value := p.measures.get(measure.key)) is None:
-            continue
-        if p.minutes is None:
-            axis.axhline(value, color="grey", linestyle=":", linewidth=1)
-            axis.annotate(p.name, (0.01, value), xycoords=("axes fraction", "data"), size=6)
-        else:
-            axis.plot(60 * p.minutes, value, "x", color="grey")
-            _label(axis, p.name, (60 * p.minutes, value), "grey", 6)
+        axis.annotate(marks[name], point, (4, 3), textcoords="offset points", size=8)
 
 
 def _draw_logs(axis: Any, outcomes: Iterable[Outcome]):
@@ -225,10 +254,6 @@ def _draw_logs(axis: Any, outcomes: Iterable[Outcome]):
         axis.plot(*_columns(curve), color=color, linewidth=1.5 if front else 0.6, label=label)
     if axis.get_legend_handles_labels()[0]:
         axis.legend(fontsize=7)
-
-
-def _label(axis: Any, text: str, point: tuple[float, float], color: str, size: int) -> None:
-    axis.annotate(text, point, (4, 3), textcoords="offset points", size=size, color=color)
 
 
 def _columns(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:

@@ -89,6 +89,7 @@ def chart(
     quick: bool = False,
     only: Annotated[tuple[str, ...], written("SETTING [SETTING ...]", "all")] = (),
     samples: int = SAMPLES,
+    seeds: Annotated[int, written("N")] = 1,
     set: Changes = (),
     jobs: AtOnce = 1,
     scheduler: Scheduler = None,
@@ -99,8 +100,8 @@ def chart(
     voxels-x0.5 (half the voxels of the finest grid), voxels-x2, rays-x0.5 (half the rays per step),
     rays-x2, the same for steps, directions and lobes, and light-NAME for other lighting models.
     Writes DIR/chart.png, chart.svg and chart.json with every metric, the log of each training run,
-    and the Pareto front of each metric. Published results are drawn in grey; they come from other
-    data and from GPUs. Finished runs are kept: run the same command again to resume.
+    and the Pareto front of each metric. Finished runs are kept: run the same command again to
+    resume.
 
     Args:
         scenes: folders of photographs
@@ -110,6 +111,8 @@ def chart(
         quick: train five settings instead of all
         only: names of the settings to train
         samples: light samples per pixel of relit images
+        seeds: training runs per scene and setting, with different random seeds; the results are
+            their medians
         set: change one configuration field of all training runs; repeatable
         jobs: number of training runs at a time; more than one distorts the times
         scheduler: Dask scheduler to use; anyone who can reach it can run code on its workers
@@ -117,7 +120,7 @@ def chart(
     from lab import chart as experiment
 
     where = {"jobs": jobs, "scheduler": scheduler}
-    print(experiment.chart(scenes, out, preset, light, quick, only, set, samples, **where))
+    print(experiment.chart(scenes, out, preset, light, quick, only, set, samples, seeds, **where))
 
 
 def stress(

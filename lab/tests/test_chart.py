@@ -1,6 +1,7 @@
 """The chart of quality against time, from made-up outcomes."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -101,3 +102,30 @@ def test_which_settings_are_trained(passed, tmp_path):
     assert {p["minutes"] for p in record["published"]} >= {18, 14, None}
     with pytest.raises(ValueError, match=r"only must be among draft, fast, full, .*, got speed"):
         module.chart([tmp_path], out, only=["fast", "speed"])
+
+
+def test_of_several_seeds_the_median_is_shown(monkeypatch, tmp_path):
+    """One run in three that came out badly changes nothing; one that failed is told."""
+    noted = []
+
+    def run(scenes, settings, out, samples, at_once, scheduler):
+        noted.extend((s.name, s.config(tmp_path, out).seed) for s in settings)
+        out.mkdir(exist_ok=True)
+        return [outcome("cup", s.name, 60, psnr) for s, psnr in zip(settings, PSNR, strict=True)]
+
+    monkeypatch.setattr(module.runner, "run", run)
+    module.chart([tmp_path], tmp_path / "out", only=["draft", "fast"], seeds=3)
+    assert noted[3:] == [("fast", 0), ("fast-s1", 1), ("fast-s2", 2)]
+    points = json.loads((tmp_path / "out" / "chart.json").read_text())["points"]
+    assert [(p["setting"], p["measures"]["nvs_psnr"]) for p in points] == [
+        ("draft", 29.0),
+        ("fast", 31.0),
+    ]
+    assert [p["ranges"]["nvs_psnr"] for p in points] == [2.0, 22.0]
+    failed = replace(outcome("cup", "fast-s1", 60, 31.0), error="ValueError: no")
+    assert module.median_of([outcome("cup", "fast", 60, 30.0), failed]).error == "ValueError: no"
+    with pytest.raises(ValueError, match="seeds must be at least 1, got 0"):
+        module.chart([tmp_path], tmp_path / "out", seeds=0)
+
+
+PSNR = (28.0, 29.0, 30.0, 10.0, 32.0, 31.0)  # three of draft, three of fast

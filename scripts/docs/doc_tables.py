@@ -156,9 +156,13 @@ def _scene(name: str) -> str:
 
 
 def _chart(record: dict[str, Any], part: str) -> str:
-    """The presets on three scenes; `small` for the README, beside what `baked` gives."""
+    """The presets on three scenes; `small` for the README, beside what `baked` gives; `seeds` with
+    how far the seeds lie apart."""
     if part == "small":
         return _beside_baked(record)
+    if part == "seeds":
+        rows = [((_scene(p["scene"]), f"`{p['setting']}`"), p["ranges"]) for p in record["points"]]
+        return measured(rows, ("scene", "preset"), (NVS, *ALBEDO, ROUGHNESS, RELIT, NORMALS))
     columns = (SECONDS, NVS, *ALBEDO, ROUGHNESS, RELIT, NORMALS, MEMORY, ("file, MB", "mb", 1))
     columns = (*columns, ("planned steps made, %", "steps", 0))
     runs = [
@@ -517,6 +521,7 @@ BESIDE = {"chart.json:small": "lights.json"}
 KINDS: dict[str, Callable[[dict[str, Any], str], str]] = {
     "chart.json": _chart,
     "chart.json:small": _chart,
+    "chart.json:seeds": _chart,
     "chart.json:trust": _trust,
     "chart.json:published": _published,
     "demo.json": _demo,
