@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -194,10 +195,15 @@ class Trials:
     cfg: JointConfig
     likely: bool  # whether the stages before saw metal
     seconds: float  # of a round on TRIAL_POINTS
+    end: float  # by time.monotonic: later no other trial begins
     seed: int  # of the points: the trials differ in nothing but the hypothesis
     parts: Sequence[nn.Module]  # of the scene, that a trial changes
     initial: list[dict[str, Any]]  # their states
     troubles: list[str]
+
+    @property
+    def in_time(self) -> bool:
+        return time.monotonic() < self.end
 
     def states(self) -> list[dict[str, Any]]:
         return [copy.deepcopy(part.state_dict()) for part in self.parts]
@@ -238,8 +244,10 @@ def initialise_(
     little more like metal than like paint.
 
     Args:
-        seconds: that the rounds of Newton may take together.
+        seconds: that the rounds of Newton may take together. Once they are over, the best so far
+            stands: a limit of a minute would leave nothing for the materials to follow the map.
     """
+    end = time.monotonic() + seconds
     changed = scene.material, problem.sky, scene.views, scene.flash
     parts = [part for part in changed if part is not None]
     seed = int(torch.randint(2**31, ()))
@@ -247,7 +255,7 @@ def initialise_(
     round_seconds = seconds / TRIAL_ROUNDS
     likely = decisions.likely
     trials = Trials(
-        scene, problem, halves(problem), cfg, likely, round_seconds, seed, parts, initial, []
+        scene, problem, halves(problem), cfg, likely, round_seconds, end, seed, parts, initial, []
     )
     only_metal = bool(cfg.only_metal)
     all_metal = torch.ones_like(decisions.metal)
@@ -255,7 +263,9 @@ def initialise_(
         best = assumed_(trials, all_metal)
     else:
         best = assumed_(trials, decisions.metal)
+    if not only_metal and trials.in_time:
         best = better_of(best, under_its_map_(trials, best))
+    if not only_metal and trials.in_time:
         everywhere = assumed_(trials, all_metal)
         explained = everywhere.residual < ONLY_METAL[likely] * best.residual
         # Under a light for each photograph what is mirrored may be anything
