@@ -107,7 +107,7 @@ def _source_of(run: Path) -> Source:
             # 0 in runs from before a size was chosen for large photographs: those were refused
             return Source(Path(data), downscale or 1, outside)
     raise DataError(
-        f"{path}: expected data, the name of a folder, and downscale, at least 0, got "
+        f"{path}: expected a folder as data and a number of at least 0 as downscale, got "
         f"{values.get('data')!r:.80} and {values.get('downscale')!r:.80}"
     )
 
@@ -223,7 +223,7 @@ def judge(evidence: Evidence) -> Verdict:
     if evidence.steps:
         word = "unfinished"
         made = ", ".join(f"{share:.0%} of {name}" for name, share in evidence.steps.items())
-        why = "it was stopped" if evidence.stopped else "the time limit was too short"
+        why = "training was stopped" if evidence.stopped else "the time limit was too short"
         reasons.insert(0, f"{why} (completed steps: {made})")
         needed = None if evidence.minutes is None else math.ceil(evidence.minutes)
         if evidence.stopped or evidence.limit is None:

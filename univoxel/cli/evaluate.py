@@ -34,13 +34,13 @@ class EvaluateOptions:
     save: Annotated[parsing.File | None, parsing.written("DIR", "none are written")] = None
     """folder to write the rendered images to"""
     json: parsing.JsonFile = None
-    """write the metrics to a file as JSON; - prints them, not the table"""
+    """write the metrics to a file as JSON; - prints them in place of the table"""
     samples: int = SAMPLES
     """light samples per pixel of relit images"""
     bounces: Annotated[int, parsing.ADVANCED] = BOUNCES
     """number of reflections between parts of the object in relit images"""
     light_of: parsing.LightOf = None
-    """training view whose light to render in, by name or number; see train --varying"""
+    """training view (name or number) in whose light to render; see train --varying"""
     test_every: Annotated[int | None, parsing.written("N", "the test split", advanced=True)] = None
     """use every Nth photograph as a test view; none may be a training photograph"""
     background: Annotated[Behind, parsing.ADVANCED] = "black"

@@ -35,7 +35,7 @@ def mlp(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tenso
     weights, biases = list(weights), list(biases)
     if not weights or len(weights) != len(biases):
         raise ValueError(
-            f"mlp: expected one of weights and one of biases for each of one or more layers, got "
+            f"mlp: expected as many weights as biases, and at least one of each, got "
             f"{len(weights)} weights and {len(biases)} biases"
         )
     layers: dict[str, tuple[Tensor, str]] = {}

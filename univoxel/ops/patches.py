@@ -71,7 +71,7 @@ def patch_correlation(
     side = math.isqrt(sizes["M"])
     if side * side != sizes["M"] or side % 2 == 0:
         raise ValueError(
-            f"patch_correlation: own must have the square of an odd number of pixels, "
+            f"patch_correlation: own must have n x n pixels per patch, with an odd n, "
             f"got {sizes['M']}"
         )
     if min(sizes["H"], sizes["W"]) < 2:
@@ -354,4 +354,4 @@ def _check_rows(op: str, rows: Tensor, count: int) -> None:
     """Each of the N rays is the ray of one pixel."""
     named = rows[rows >= 0].sort().values
     if not torch.equal(named, torch.arange(count, device=rows.device)):
-        raise ValueError(f"{op}: rows must contain each of the {count} rays once, else -1")
+        raise ValueError(f"{op}: rows must contain each of the {count} rays once, and else -1")

@@ -149,7 +149,7 @@ def sum_rows(
     """
     if not rows or len(rows) != len(values):
         raise ValueError(
-            f"sum_rows: expected equally many rows and values, at least one of each, got "
+            f"sum_rows: expected as many rows as values, and at least one of each, got "
             f"{len(rows)} and {len(values)}"
         )
     arguments: dict = {}

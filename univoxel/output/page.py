@@ -241,11 +241,13 @@ POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "img-src data: blob:; connect-src data: blob:"
 )
-LICENCE = "Drawn with three.js, \u00a9 three.js authors, MIT licence, in the page's source."
+LICENCE = (
+    "Drawn with three.js (\u00a9 three.js authors; its MIT licence is in the source of the page)."
+)
 SOURCES = {name: f"Map {name!r}: Greg Zaal, Poly Haven, CC0." for name in PHOTOGRAPHED}
 KEYS = """1 to 5: layers
 Left, Right: rotate the light; Space: rotate it continuously
-L: dragging rotates the light, as it does with Shift
+L: let dragging rotate the light instead of the view; so does holding Shift
 B: backdrop, S: save the image, 0: first view"""
 
 

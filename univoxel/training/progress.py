@@ -172,7 +172,9 @@ class Progress:
         self._show(f"preparation: {what}", "")
         if not needed and self.clock.hurried and not self._goes_on:
             self.skipped.append(what)
-            log.info(f"minutes leaves no time for {what}", extra={"arguments": ("minutes",)})
+            log.info(
+                f"minutes leaves no time for a step: {what}", extra={"arguments": ("minutes",)}
+            )
         return what not in self.skipped
 
     def prepared(self) -> None:
