@@ -118,7 +118,7 @@ PICTURES = PicturesConfig()
 
 @dataclass(frozen=True)
 class Captured:
-    """What a capture leaves: the pages and files to open."""
+    """The results of a capture: the page and files to open."""
 
     page: Path
     mesh: Path  # .glb
@@ -136,8 +136,8 @@ def capture(
 ) -> Captured:
     """Turn photographs into a relightable object, in steps whose results are kept.
 
-    The folder `out` then has scene/ (photographs and cameras), cut/ (the same with masks), run/
-    (the training), pictures/ (the object under new light, and metrics), the mesh and index.html.
+    The folder `out` gets scene/ (photographs and cameras), cut/ (the same with masks), run/ (the
+    trained run), pictures/ (the object under new light, and metrics), the mesh and index.html.
     Finished steps are kept: after an interruption, call the function again to resume. If you
     already have cameras, masks or a run, the steps that make them are skipped.
 

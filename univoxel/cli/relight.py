@@ -273,8 +273,7 @@ def relight_images(
 ) -> Tensor:
     """Render a trained scene under new light: [F, H, W, 4] linear RGBA, premultiplied.
 
-    Of cameras with pictures of differing sizes, the smaller ones have nothing but 0 below and to
-    the right of them.
+    If the images differ in size, the smaller ones are padded with 0 below and to the right.
 
     Args:
         run: folder of the trained scene.

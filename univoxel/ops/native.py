@@ -41,7 +41,7 @@ _told: set[str] = set()  # reasons that were told, once each
 
 @dataclass(frozen=True)
 class NativeStatus:
-    """What is known of the compiled extension."""
+    """The status of the compiled extension."""
 
     loaded: bool
     variant: str | None  # instruction set of the build that is loaded: default, avx2 or avx512

@@ -20,8 +20,8 @@ def mlp(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tenso
 
     Args:
         x: [N, A] any number of rows.
-        weights: one [out, in] a layer, as in torch.nn.Linear; every size at least 1.
-        biases: one [out] a layer.
+        weights: one [out, in] per layer, as in torch.nn.Linear; every size at least 1.
+        biases: one [out] per layer.
 
     Returns:
         [N, Z], Z the last layer's `out`.

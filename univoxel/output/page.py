@@ -253,19 +253,19 @@ B: backdrop, S: save the image, 0: first view"""
 
 @dataclass(frozen=True)
 class PageOptions:
-    """What a page holds.
+    """What a page contains.
 
     Raises:
-        UserError: a name of a map is there twice.
+        UserError: two maps have the same name.
     """
 
-    title: str | None = None  # None: the run folder's name
-    envmaps: Sequence[str | Path] = ()  # maps to offer before the usual ones
-    notes: str = ""  # what to tell first
-    measures: Mapping[str, str] = field(default_factory=dict)  # what to tell, by what it is
-    faces: int = FACES  # most triangles
-    texture_size: int = TEXTURE_SIZE  # texels along a side, a power of 2
-    albedo_near: AlbedoNear | None = None  # what gives the albedo, in place of the field
+    title: str | None = None  # None: the name of the run's folder
+    envmaps: Sequence[str | Path] = ()  # maps to offer before the built-in ones
+    notes: str = ""  # text at the beginning of the page
+    measures: Mapping[str, str] = field(default_factory=dict)  # metrics to show, by their names
+    faces: int = FACES  # maximum number of triangles
+    texture_size: int = TEXTURE_SIZE  # width of the square textures in texels, a power of 2
+    albedo_near: AlbedoNear | None = None  # source of the albedo; None: the field
 
     def __post_init__(self) -> None:
         names = [Path(path).stem for path in self.envmaps]

@@ -168,12 +168,12 @@ class ReportOptions:
         UserError: a number is out of range.
     """
 
-    title: str | None = None  # None: the run folder's name
-    data: str | Path | None = None  # photographs; None: those that the run names
-    views: int = 4  # photographs beside their render, the worst first; >= 0
-    size: int = 256  # pixels along the longer side of pictures, >= 16
-    advice: AdviceConfig = ADVICE  # how directions are chosen
-    albedo_near: AlbedoNear | None = None  # what gives the albedo, in place of the field
+    title: str | None = None  # None: the name of the run's folder
+    data: str | Path | None = None  # folder of the photographs; None: the one that the run names
+    views: int = 4  # number of photographs to show beside their render, the worst first; >= 0
+    size: int = 256  # longer side of the images in pixels, >= 16
+    advice: AdviceConfig = ADVICE  # how directions for more photographs are chosen
+    albedo_near: AlbedoNear | None = None  # source of the albedo; None: the field
 
     def __post_init__(self) -> None:
         for name, least in (("views", 0), ("size", 16)):

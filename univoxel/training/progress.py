@@ -77,7 +77,7 @@ CHECKPOINT_SECONDS = 20.0  # of work that a kill costs, about
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """How far a training is."""
+    """The progress of a training run."""
 
     stage: int  # from 1
     stages: int
