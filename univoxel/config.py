@@ -77,7 +77,7 @@ class StageConfig:
         0.01, "smoothing of the updated feature nodes, per step", least=0, most=0.25
     )
     physical_from: float = setting(
-        0.3, "progress at which the physically based render is added", least=0, most=1
+        0.3, "progress at which physically based rendering is added", least=0, most=1
     )
     patches_from: float = setting(
         0.0, "progress at which patches are compared between photographs", least=0, most=1
@@ -124,7 +124,7 @@ class EntropyConfig:
 class JointConfig:
     """Joint optimisation of one environment map, materials and normals: training/joint_solve.py."""
 
-    iterations: int = setting(675, "Adam steps in all rounds; fewer if time runs out", least=1)
+    iterations: int = setting(675, "total number of Adam steps; fewer if time runs out", least=1)
     share: float = setting(0.27, "share of the time limit", above=0, most=1)
     rays: int = setting(2048, "number of observations per step, at least views")
     views: int = setting(4, "number of observations of each point per step", least=1)
@@ -221,7 +221,7 @@ class TrainConfig:
         kinds = [s.field for s in self.stages if isinstance(s, StageConfig)]
         if "hash" in kinds and set(kinds) != {"hash"}:
             raise ConfigError(
-                f"TrainConfig: all stages or none must use the field hash, got {', '.join(kinds)}"
+                f"TrainConfig: either all stages or none must use hash, got {', '.join(kinds)}"
             )
         if kinds != sorted(kinds):
             raise ConfigError(

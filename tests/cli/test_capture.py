@@ -367,7 +367,7 @@ def test_the_first_steps_alone(steps, pictures, tmp_path):
     assert [name for name, *_ in steps] == ["poses", "cutout"]
     assert task.capture(pictures, out, masks="none").page.exists()  # goes on with them
     assert [name for name, *_ in steps] == ["poses", "cutout", "train"]
-    with pytest.raises(UserError, match="is a trained run: until must be page"):
+    with pytest.raises(UserError, match="is a trained run, so until must be page"):
         task.find_data(out / "run", tmp_path / "other")
 
 

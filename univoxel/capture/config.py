@@ -29,7 +29,7 @@ class CaptureConfig:
     seed: int = setting(0, "random seed", least=0)
     exhaustive: int = setting(
         24,
-        "maximum number of photographs for matching all pairs; above it, only similar ones",
+        "up to this number of photographs, match all pairs; of more, match only similar pairs",
         least=2,
     )
     partners: int = setting(16, "number of similar photographs to match with each one", least=1)

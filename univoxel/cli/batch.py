@@ -36,7 +36,7 @@ class BatchOptions:
     )
     """steps to run for each scene, in this order: poses masks train eval export page"""
     masks: Annotated[str, parsing.written("auto|rembg|FOLDER|none")] = "auto"
-    """source of the masks in the step masks, as in capture --masks"""
+    """source of the masks for the step masks, as in capture --masks"""
     preset: choices.PresetOrAuto = "auto"
     """amount of work, from draft to best; auto: chosen to fit --minutes, else fast"""
     light: Annotated[choices.LightName, parsing.ADVANCED] = "hybrid"
@@ -97,8 +97,8 @@ def command(asked: BatchOptions) -> None:
 
     Each step of a scene runs in its own process, so a crash does not affect the other scenes.
     Finished steps are kept: run the same command again to resume, or to retry failed scenes.
-    NIGHT/index.html shows all scenes, batch.json and batch.csv hold their metrics, NIGHT/SCENE the
-    results and NIGHT/logs the logs. If a scene fails, the exit code is 2.
+    NIGHT/index.html shows all scenes, and batch.json and batch.csv list their metrics. The results
+    of a scene are in NIGHT/SCENE, and all logs in NIGHT/logs. If a scene fails, the exit code is 2.
     """
     import rich
 

@@ -218,7 +218,7 @@ def find_data(
     asked = CaptureOptions(Path(photographs), Path(out), **options)
     given, project = look_at(asked.photographs), Project(asked.out)
     if given.kind == "run":
-        raise UserError(f"{given.path} is a trained run: until must be page for it", "until")
+        raise UserError(f"{given.path} is a trained run, so until must be page", "until")
     _check_machine(given, asked)
     begin(project, given)
     _check_network(project, asked)

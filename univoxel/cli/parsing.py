@@ -335,7 +335,7 @@ def completion(shell: Shell, commands: Mapping[str, Command], lab: Mapping[str, 
     """The script that makes a shell complete commands, options and their choices.
 
     Args:
-        lab: commands of the experiments; none where it is not there.
+        lab: commands of the experiments; empty if they are not available.
     """
 
     import tyro

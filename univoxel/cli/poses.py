@@ -18,7 +18,7 @@ class PosesOptions:
     out: Annotated[Path, written("SCENE")]
     """folder to write to; delete its sfm/ when you are done"""
     masks: Annotated[Path | None, written("DIR", "the whole images")] = None
-    """folder of masks, which a turntable needs; features are detected only inside"""
+    """folder of masks inside which features are detected; required on a turntable"""
     every: Annotated[float | None, written("SECONDS", "80 frames in all")] = None
     """from each period of this length in a video, take the sharpest frame"""
     keep_size: Annotated[int, written("PIXELS", advanced=True)] = KEEP_SIZE

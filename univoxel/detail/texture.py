@@ -304,7 +304,7 @@ def make_detail(scene: Scene, photos: Photos, size: int | None = None) -> Detail
     errors = torch.tensor([baking.errors(view) for view in held])  # [H, 2]
     before, after = errors.nanmean(0).tolist() if len(held) else (math.nan, math.nan)
     if not after < before:
-        log.info("detail: no texture added, because it predicts validation photographs no better")
+        log.info("detail: no texture added, because it would not predict photographs better")
         return None
     for view in held:
         baking.add(view)

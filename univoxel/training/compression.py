@@ -308,8 +308,8 @@ def check_budget(scene: Scene, budget_mb: float) -> None:
     least = _bytes_apart_from_grid(scene) + FEWEST_VOXELS // 2 * _node_bytes(scene)
     if 1e6 * budget_mb < least:
         raise UserError(
-            f"budget_mb must be at least {least / 1e6:.2g}, for networks, environment map and the "
-            f"coarsest grid, got {budget_mb:g}",
+            f"budget_mb must be at least {least / 1e6:.2g} to hold networks, environment map and "
+            f"the coarsest grid, got {budget_mb:g}",
             "budget_mb",
         )
 
