@@ -84,7 +84,7 @@ def poses(
     Raises:
         MissingExtra: pycolmap or the reader of a format is missing.
         DataError: photographs cannot be used, or too few can be registered. StillBackground: the
-            object was turned before a static camera, and there are no masks.
+            object was rotated in front of a static camera, and there are no masks.
         ExistingFile: out holds something else.
         ProcessFailed: a step failed.
         OSError: a file cannot be written.

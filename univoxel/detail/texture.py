@@ -310,7 +310,7 @@ def make_detail(scene: Scene, photos: Photos, size: int | None = None) -> Detail
         baking.add(view)
     gain = -10 * math.log10(after / before)
     log.info(
-        "detail: a texture of %d x %d from %d photographs predicts the others %.1f dB better",
+        "detail: a texture of %d x %d from %d photographs, which predicts others %.1f dB better",
         *(atlas.size, atlas.size, len(photos), gain),
     )
     albedo = baking.picture()

@@ -50,7 +50,7 @@ def encode_hash(
         sparse_grad: return the gradient of table as a coalesced ``sparse_coo`` tensor that contains
             only the touched rows, as ``RowAdam`` takes it. Eager only: under torch.compile, use
             dense gradients.
-        felt: number of coarsest levels that pass gradients on to points, at least 0; None: all.
+        felt: number of levels, counted from the first, that pass gradients on to points; None: all.
 
     Returns:
         [M, L * F], level after level.

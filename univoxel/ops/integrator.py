@@ -22,7 +22,7 @@ Strategy = Literal["mis", "map", "brdf"]
 
 @dataclass(frozen=True)
 class EnvTables:
-    """An environment map as the integrator reads it; `univoxel.envmap.tables` makes them."""
+    """An environment map as the integrator reads it, created by `univoxel.envmap.tables`."""
 
     texel: Tensor  # [H, W, 4] float32: linear radiance, >= 0; sampling density, 1 / steradian
     row_cdf: Tensor  # [H + 1] float32 from 0 to 1: which row a sample falls in

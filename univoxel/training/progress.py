@@ -79,14 +79,14 @@ CHECKPOINT_SECONDS = 20.0  # of work that a kill costs, about
 class TrainingProgress:
     """The progress of a training run."""
 
-    stage: int  # from 1
-    stages: int
-    name: str  # what the stage is for, such as "shape"
-    share: float  # of the whole run, in [0, 1]
-    seconds: float  # of training so far
-    remaining: float  # seconds, about
-    losses: dict[str, float]  # weighted, by name
-    held_out_psnr: float | None  # dB, of pixels that are only looked at; None: not measured now
+    stage: int  # number of the stage, starting at 1
+    stages: int  # number of stages
+    name: str  # name of the stage, such as "shape"
+    share: float  # progress of the whole run, in [0, 1]
+    seconds: float  # training time so far
+    remaining: float  # estimated remaining seconds
+    losses: dict[str, float]  # weighted losses, by name
+    held_out_psnr: float | None  # PSNR of validation pixels, dB; None: not measured in this call
     rays_per_second: float
 
 
