@@ -58,9 +58,9 @@ def compare(
     """Train scenes with every lighting model and compare the results.
 
     Writes DIR/compare.md, compare.json, compare.png and compare.svg. DIR/SCENE/LIGHT keeps each
-    training run with its metrics (result.json): run the same command again to resume, or to retry
-    failed runs. They run one after another, each in its own process. Run nothing else meanwhile,
-    because that would distort the times.
+    training run with its metrics (result.json). To resume, or to retry failed runs, run the same
+    command again. Scenes are trained one after another, each in its own process. Do not run
+    anything else meanwhile, because that would distort the times.
 
     Args:
         scenes: folders of photographs
@@ -138,9 +138,9 @@ def stress(
 ) -> None:
     """Find the limits of the method, on scenes with ground truth.
 
-    Renders small scenes with Mitsuba 3, which become harder along one axis at a time, then trains
-    on each and measures the result. Writes DIR/stress.md with the breaking point of each axis,
-    stress.json, stress.png and stress.svg.
+    Renders small scenes with Mitsuba 3, in which one property (the axis) becomes harder from level
+    to level, then trains on each and measures the result. Writes DIR/stress.md with the breaking
+    point of each axis, stress.json, stress.png and stress.svg.
     Axes: roughness, metal, concavity, sun, views, pose, exposure, light, masks, rough-masks, thin,
     fur, turntable, noise, placement, dark, bright; light-varying is trained with --varying light.
     A failed training run counts as a result. Finished runs are kept: run the same command again to
@@ -208,19 +208,19 @@ def published(
     set: Changes = (),
     jobs: AtOnce = 1,
 ) -> None:
-    """Train on public data sets that you have, and print their tables.
+    """Train on your copies of public data sets, and print a table for each.
 
-    Finds scenes of Synthetic4Relight, TensoIR-Synthetic, Shiny Blender and Stanford-ORB, trains on
-    each, and prints a table per data set with the metrics of its papers and what differs from
-    their protocol. Writes published.md and published.json too. The same command resumes after an
-    interruption. Nobody has run it on the real data sets yet.
+    Finds scenes of Synthetic4Relight, TensoIR-Synthetic, Shiny Blender and Stanford-ORB, and trains
+    on each. The table of a data set has the metrics of its papers and lists the differences from
+    their protocol. Also writes published.md and published.json. Finished runs are kept: run the
+    same command again to resume. The command has not been run on the real data sets yet.
 
     Args:
-        folder: folder that holds the data sets, or one scene
-        out: folder for trainings and tables
-        preset: how much work goes into each training
-        set: configuration field of all trainings, as in train --set
-        jobs: trainings at the same time
+        folder: folder that contains the data sets, or one scene
+        out: folder for training runs and tables
+        preset: amount of work, from draft to best
+        set: change one configuration field of all training runs; repeatable
+        jobs: number of training runs at a time
     """
     from lab import published as experiment
 

@@ -71,7 +71,7 @@ def test_data_that_cannot_be_used(data, tmp_path, refused, change, message):
     [
         (["--minutes", "0"], "--minutes must be above 0, got 0"),
         (["--set=stages.0.share=1.5"], r"StageConfig: share must be in \(0, 1\], got 1.5"),
-        (["--varying", "light", "--light", "envmap"], "varying light needs hybrid or a local"),
+        (["--varying", "light", "--light", "envmap"], "--varying light needs hybrid or a local"),
         (["--varying", "weather"], "'weather' for argument '--varying'"),
     ],
 )

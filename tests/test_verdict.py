@@ -66,7 +66,7 @@ def test_a_run_that_time_cut_is_unfinished():
 
 def test_a_run_that_was_stopped_is_unfinished():
     found = of(steps={"shape": 0.6}, stopped=True, minutes=2.4, limit=1.0)
-    assert "it was stopped" in found.sentence()
+    assert "training was stopped" in found.sentence()
     assert found.remedies == ("resume the training with `--resume`",)
 
 

@@ -48,7 +48,9 @@ class StageConfig:
     """A stage of training at one grid resolution. Pairs are values at the start and the end."""
 
     voxels: float = field(
-        metadata=about("maximum in the object's box; see voxel_pixels", unit="millions", above=0)
+        metadata=about(
+            "maximum number in the object's box; see voxel_pixels", unit="millions", above=0
+        )
     )
     iterations: int = field(metadata=about("optimisation steps; fewer if time runs out", least=1))
     share: float = field(
@@ -56,13 +58,13 @@ class StageConfig:
     )
     rays: int = setting(2048, "rays per step", least=1)
     sharpness: tuple[float, float] = setting(
-        (0.5, 0.3), "s of the NeuS density at the start and the end", unit="voxels", above=0
+        (0.5, 0.3), "width s of the NeuS density at the start and the end", unit="voxels", above=0
     )
     lr_sdf: tuple[float, float] = setting(
-        (0.07, 0.005), "learning rate of the sdf, start and end", unit="voxels per step", above=0
+        (0.07, 0.005), "learning rate of the signed distances", unit="voxels per step", above=0
     )
     lr_features: tuple[float, float] = setting(
-        (0.1, 0.01), "learning rate of features and the table of reflections", above=0
+        (0.1, 0.01), "learning rate of features and of the direction table", above=0
     )
     lr_networks: tuple[float, float] = setting(
         (6e-3, 3e-4), "learning rate of networks, light and per-view parameters", above=0
@@ -75,12 +77,12 @@ class StageConfig:
         0.01, "smoothing of the updated feature nodes, per step", least=0, most=0.25
     )
     physical_from: float = setting(
-        0.3, "progress at which the physically based render is added", least=0, most=1
+        0.3, "progress at which physically based rendering is added", least=0, most=1
     )
     patches_from: float = setting(
         0.0, "progress at which patches are compared between photographs", least=0, most=1
     )
-    refit: bool = setting(False, "freeze the materials; fit light, radiance and shape")
+    refit: bool = setting(False, "whether to freeze materials and fit light, radiance and shape")
     field: FieldName = setting(
         "hash", "storage of features: every grid node, bricks at the surface, or a hash table"
     )
@@ -95,7 +97,9 @@ class LossConfig:
     radiance: float = setting(1.0, "photometric loss of the radiance head's render", least=0)
     silhouette: float = setting(0.1, "difference between ray opacity and masks", least=0)
     metallic: float = setting(0.01, "penalty on the mean metallic value", least=0)
-    light_smoothness: float = setting(0.1, "L1 norm of local light's change over a voxel", least=0)
+    light_smoothness: float = setting(
+        0.1, "L1 norm of the change of local light per voxel", least=0
+    )
     white_light: float = setting(0.01, "relative distance of the mean light from grey", least=0)
     map_smoothness: float = setting(1e-3, "total variation of the log environment map", least=0)
     patches: float = setting(
@@ -110,7 +114,7 @@ class EntropyConfig:
     """The prior that an object has few albedo colours, see training/albedo_entropy.py."""
 
     teaching_steps: int = setting(
-        60, "steps to learn new albedos after the environment map changed", least=1
+        60, "steps in which the material head learns new albedos after the map changes", least=1
     )
 
     __post_init__ = check_settings
@@ -120,14 +124,14 @@ class EntropyConfig:
 class JointConfig:
     """Joint optimisation of one environment map, materials and normals: training/joint_solve.py."""
 
-    iterations: int = setting(675, "Adam steps in all rounds; fewer if time runs out", least=1)
+    iterations: int = setting(675, "total number of Adam steps; fewer if time runs out", least=1)
     share: float = setting(0.27, "share of the time limit", above=0, most=1)
-    rays: int = setting(2048, "observations per step, no fewer than views")
-    views: int = setting(4, "observations of a point per step", least=1)
-    rounds: int = setting(4, "rounds, each of Newton steps on the map, then Adam steps", least=1)
+    rays: int = setting(2048, "number of observations per step, at least views")
+    views: int = setting(4, "number of observations of each point per step", least=1)
+    rounds: int = setting(4, "number of rounds of Newton steps on the map and Adam steps", least=1)
     points: int = setting(20400, "number of surface points", least=1)
     tracing: int = setting(2, "visibility rays per point and direction", least=1)
-    colors: bool = setting(True, "minimise the entropy of the albedo; see entropy")
+    colors: bool = setting(True, "whether to minimise the entropy of the albedo; see entropy")
     only_metal: bool | None = setting(
         None, "whether the whole object is metal; None: a multi-start initialisation decides"
     )
@@ -141,11 +145,11 @@ class JointConfig:
     )
     newton_steps: int = setting(3, "Newton steps at the start of a round", least=0)
     newton_points: int = setting(1900, "number of points in a Newton step", least=1)
-    newton_views: int = setting(8, "observations of each of these points", least=2)
+    newton_views: int = setting(8, "number of observations of each of newton_points", least=2)
     newton_smooth: float = setting(
         1e-7, "weight of the log map's Laplacian, relative to the mean squared residual", above=0
     )
-    entropy: EntropyConfig = setting(EntropyConfig(), "prior on few colours, used with colors")
+    entropy: EntropyConfig = setting(EntropyConfig(), "prior on few albedos, used with colors")
 
     def __post_init__(self) -> None:
         check_settings(self)
@@ -154,7 +158,7 @@ class JointConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """The complete configuration of a training."""
+    """The complete configuration of a training run."""
 
     data: Path = field(metadata=about("folder of the data set"))
     out: Path = field(metadata=about("folder of the run"))
@@ -171,12 +175,12 @@ class TrainConfig:
         1.0, "minimum width of a voxel in pixels of the photographs, at the object", least=0
     )
     seed: int = setting(0, "random seed; it does not change the validation pixels")
-    masks: MasksFrom = setting("auto", "auto: masks that extend past the object's edge are eroded")
+    masks: MasksFrom = setting("auto", "auto: erode masks that extend past the object's edge")
     cameras: CamerasFrom = setting(
         "auto", "refined: optimise camera poses; auto: only if silhouettes are inconsistent"
     )
     exposures: bool = setting(
-        True, "look for different exposures; if found, scene.varying changes from none to exposure"
+        True, "whether to look for differing exposures; if found, scene.varying becomes exposure"
     )
     allow_outside: bool = setting(
         False, "also read files outside the folder if the data set refers to them"
@@ -191,13 +195,13 @@ class TrainConfig:
     )
     carving_seconds: float = setting(
         12.0,
-        "carve concavities only if this is expected to suffice on two cores; never if light varies",
+        "maximum expected time of carving on two cores; 0 or varying light: no carving",
         unit="seconds",
         least=0,
     )
     patience: float = setting(
         0.0,
-        "shorten a stage if validation gains less than this in 15 % of it; 0: never",
+        "end a stage early if validation PSNR rises by less than this in 15 % of it; 0: never",
         unit="dB",
         least=0,
     )
@@ -212,12 +216,12 @@ class TrainConfig:
         check_settings(self)
         check_fields(self, "a path", lambda x: isinstance(x, Path), "data", "out")
         check_fields(self, "a path in UTF-8", _is_utf8, "data", "out")
-        first = "a StageConfig first, which creates the grid"
+        first = "a tuple whose first stage is a StageConfig, which creates the grid"
         check_fields(self, first, lambda x: x and isinstance(x[0], StageConfig), "stages")
         kinds = [s.field for s in self.stages if isinstance(s, StageConfig)]
         if "hash" in kinds and set(kinds) != {"hash"}:
             raise ConfigError(
-                f"TrainConfig: either all stages use hash or none does, got {', '.join(kinds)}"
+                f"TrainConfig: either all stages or none must use hash, got {', '.join(kinds)}"
             )
         if kinds != sorted(kinds):
             raise ConfigError(
@@ -272,7 +276,7 @@ def load_config(path: Path) -> TrainConfig:
         ConfigError: it holds something else; the message names file and field.
     """
     if not path.is_file():
-        raise MissingFile(f"{path}: expected a configuration, such as config.json of a run")
+        raise MissingFile(f"{path}: expected the config.json of a run, but there is no such file")
     values = read_json(path)
     try:
         if not isinstance(values, dict):

@@ -11,7 +11,7 @@ def some(names: Sequence[object], most: int = 5) -> str:
 
 
 class Cancelled(Exception):
-    """Raise it in on_progress to end a training, which can then be resumed."""
+    """Raise this in on_progress to end a training run, which can then be resumed."""
 
 
 class UserError(ValueError):
@@ -31,19 +31,19 @@ class UserError(ValueError):
 
 
 class ConfigError(UserError):
-    """A configuration that is contradictory, or has a field that is out of range."""
+    """A configuration is contradictory or has a field that is out of range."""
 
 
 class DataError(UserError):
-    """Input that cannot be used: the message names the file, and what was expected and found."""
+    """Input cannot be used: the message names the file, and what was expected and found."""
 
 
 class WithoutMasks(DataError):
-    """Photographs without masks."""
+    """The photographs have no masks."""
 
 
 class StillBackground(DataError):
-    """Photographs without masks of an object that was turned before a static camera.
+    """Photographs without masks show an object that was rotated in front of a static camera.
 
     Args:
         seen: the evidence, in words.
@@ -51,27 +51,27 @@ class StillBackground(DataError):
 
     def __init__(self, seen: str):
         super().__init__(
-            f"{seen}: it seems that the object was rotated before a static camera. Make masks of "
-            "the object and pass them as masks=DIR, so that the background is ignored",
+            f"{seen}: it seems that the object was rotated in front of a static camera. Make masks "
+            "of the object and pass them as masks=DIR, so that the background is ignored",
             "masks",
         )
         self.seen = seen
 
 
 class NoSurface(UserError):
-    """A scene without a surface, or whose surface is in no photograph."""
+    """The scene has no surface, or no photograph shows it."""
 
 
 class FileError(UserError, OSError):
-    """A file of the user that cannot be written."""
+    """A file of the user cannot be written."""
 
 
 class MissingFile(FileError, FileNotFoundError):
-    """A file that does not exist."""
+    """A file does not exist."""
 
 
 class ExistingFile(FileError, FileExistsError):
-    """A file or folder that would be overwritten."""
+    """A file or folder would be overwritten."""
 
 
 class MissingExtra(UserError, ImportError):
@@ -83,4 +83,4 @@ class MissingNative(UserError, RuntimeError):
 
 
 class ProcessFailed(UserError, RuntimeError):
-    """Another process, such as a training or a renderer, failed or is in the way."""
+    """Another process, such as a training run or a renderer, failed or is in the way."""

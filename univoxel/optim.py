@@ -25,9 +25,9 @@ class RowAdam(torch.optim.Optimizer):
         params: parameters or groups of them, as for any optimizer.
         lr: learning rate, at least 0.
         betas: decay of the first and second moment, each in [0, 1).
-        eps: beside the root of the corrected second moment, at least 0, in the unit of the
-            gradient. A grid wants its own: 1e-3 to 1e-2 of the mean over a batch keeps voxels that
-            are rarely seen from taking full steps on noise.
+        eps: added to the root of the corrected second moment, at least 0, in the unit of the
+            gradient. A grid should have its own: with 1e-3 to 1e-2 of the mean over a batch, voxels
+            that are rarely seen do not take full steps on noise.
 
     Raises:
         ValueError: a number out of range; a sparse gradient of a parameter that is not contiguous.
@@ -43,7 +43,7 @@ class RowAdam(torch.optim.Optimizer):
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
-        """Add a group, with the optimizer's lr, betas and eps where it has none of its own."""
+        """Add a group; lr, betas and eps that it lacks are those of the optimizer."""
         group = self.defaults | param_group
         for name in ("lr", "eps"):
             if not group[name] >= 0:
@@ -58,8 +58,8 @@ class RowAdam(torch.optim.Optimizer):
 
     @torch.no_grad()
     def follow(self, old: Tensor, new: Tensor) -> None:
-        """Go on with another tensor in place of one: the same, or with more rows at its end, which
-        begin without moments."""
+        """Replace a tensor by another: the same, or one with more rows at its end, which start
+        without moments."""
         if new is old:
             return
         for group in self.param_groups:

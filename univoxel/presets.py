@@ -130,7 +130,7 @@ def with_metal(cfg: TrainConfig, metal: Metal) -> TrainConfig:
         return cfg
     if not any(isinstance(s, JointConfig) for s in cfg.stages):
         raise UserError(
-            f"metal={metal} needs light=hybrid, which can find reflections in metal, got "
+            f"metal={metal} needs light=hybrid, the only model that classifies metals, got "
             f"{cfg.scene.light.kind}",
             *("metal", "light"),
         )

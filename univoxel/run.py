@@ -107,7 +107,7 @@ def _source_of(run: Path) -> Source:
             # 0 in runs from before a size was chosen for large photographs: those were refused
             return Source(Path(data), downscale or 1, outside)
     raise DataError(
-        f"{path}: expected data, the name of a folder, and downscale, at least 0, got "
+        f"{path}: expected a folder as data and a number of at least 0 as downscale, got "
         f"{values.get('data')!r:.80} and {values.get('downscale')!r:.80}"
     )
 
@@ -132,25 +132,25 @@ GOOD_RESIDUAL, POOR_RESIDUAL = 0.15, 0.8
 class Evidence:
     """The evidence for a verdict; None: not measured."""
 
-    steps: Mapping[str, float]  # share made, by name of the stages that were cut
-    stopped: bool = False  # by hand
-    minutes: float | None = None  # in which all steps would have been made
-    limit: float | None = None  # minutes; None: there was none
-    psnr: float | None = None  # dB, of validation pixels
+    steps: Mapping[str, float]  # share of the steps that were run, by name of each shortened stage
+    stopped: bool = False  # whether training was stopped by hand
+    minutes: float | None = None  # minutes that all steps would have needed
+    limit: float | None = None  # time limit in minutes; None: there was none
+    psnr: float | None = None  # PSNR of validation pixels, dB
     outline: float | None = None  # share of validation pixels on the wrong side of the silhouette
     hidden: float | None = None  # share of the surface that too few cameras see
     residual: float | None = None  # share of the surface that differs from its photographs
-    troubles: int = 0  # steps or stages that went wrong and were repaired
+    troubles: int = 0  # number of failures from which training recovered
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The quality of a run in a word, with reasons and remedies."""
+    """The quality of a run in one word, with reasons and remedies."""
 
     word: Word
-    complete: bool  # whether all planned steps were made
-    reasons: tuple[str, ...]  # what speaks against "good", the worst first
-    remedies: tuple[str, ...]  # at most two, the most helpful first
+    complete: bool  # whether all planned steps were run
+    reasons: tuple[str, ...]  # reasons against the verdict "good", the worst first
+    remedies: tuple[str, ...]  # at most two suggestions, the most helpful first
     evidence: Evidence
 
     @property
@@ -223,7 +223,7 @@ def judge(evidence: Evidence) -> Verdict:
     if evidence.steps:
         word = "unfinished"
         made = ", ".join(f"{share:.0%} of {name}" for name, share in evidence.steps.items())
-        why = "it was stopped" if evidence.stopped else "the time limit was too short"
+        why = "training was stopped" if evidence.stopped else "the time limit was too short"
         reasons.insert(0, f"{why} (completed steps: {made})")
         needed = None if evidence.minutes is None else math.ceil(evidence.minutes)
         if evidence.stopped or evidence.limit is None:

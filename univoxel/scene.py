@@ -53,7 +53,7 @@ class SceneConfig:
         most=MOST_ROWS,
     )
     mirrored: bool = setting(
-        True, "whether a local light has a network for sharp specular reflections"
+        True, "whether local light has a specular network, for sharp reflections"
     )
     light: lights.LightConfig = setting(lights.SGConfig(), "lighting model with its own sizes")
     roughness: float | None = setting(
@@ -93,15 +93,16 @@ class SceneConfig:
             )
         if self.turntable is not None and self.varying == "light":
             raise ConfigError(
-                "SceneConfig: light that rotates with the camera cannot vary as well; only "
-                "exposure can",
+                "SceneConfig: light that rotates with the camera (a turntable) cannot also differ "
+                "between photographs, got varying=light; varying=exposure is possible",
                 "light_frame",
                 "varying",
             )
         if self.varying == "light" and not isinstance(self.light, lights.LocalLightConfig):
             raise ConfigError(
-                "SceneConfig: varying light needs hybrid or a local lighting model (sg, sh or "
-                f"mlp), got {self.light.kind}; varying exposure works with all of them"
+                "SceneConfig: varying=light needs hybrid or a local lighting model (sg, sh or "
+                f"mlp), got {self.light.kind}; varying=exposure works with all lighting models",
+                "varying",
             )
 
 

@@ -89,7 +89,7 @@ def test_each_view_is_in_its_own_light(orb, tmp_path):
 
 
 def test_runs_and_arguments_that_cannot_be_used(orb, tmp_path):
-    with pytest.raises(ExistingFile, match="exists already: choose another out"):
+    with pytest.raises(ExistingFile, match="exists already: choose another folder for out"):
         submit(orb / "run", tmp_path)
     with pytest.raises(
         UserError, match="expected samples >= 1 and bounces >= 0, got samples=0 and bounces=2"

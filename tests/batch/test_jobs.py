@@ -194,7 +194,7 @@ def test_other_options_are_refused(tmp_path):
     assert run_job(job).state == "done"
     job.check_same()
     other = dataclasses.replace(job, identity={"seed": 2, "steps": 2})
-    with pytest.raises(ExistingFile, match=r"mug\.json was written for other seed: choose"):
+    with pytest.raises(ExistingFile, match=r"mug\.json has other values of seed: choose"):
         other.check_same()
 
 
@@ -276,7 +276,7 @@ def test_a_scheduler_that_is_gone_is_said_and_its_work_ends(tmp_path):
             running.kill()
 
         threading.Thread(target=kill).start()
-        with pytest.raises(ProcessFailed, match="lost contact with the scheduler: run the same"):
+        with pytest.raises(ProcessFailed, match="lost the connection to the scheduler: run"):
             list(run_jobs(client, [job], 1))
         wait_for(lambda: not alive(begun(tmp_path, "mug")[0]))
     last = counting(tmp_path, "mug", last=int((tmp_path / "mug" / "at").read_text()) + 2)
@@ -291,7 +291,7 @@ def test_a_worker_without_the_package_is_named(tmp_path):
 
     with connect(1) as client, pytest.MonkeyPatch.context() as patch:
         patch.setattr("univoxel.batch.jobs.run_on_worker", run_on_worker)
-        with pytest.raises(ProcessFailed, match="a worker lacks univoxel or has another version"):
+        with pytest.raises(ProcessFailed, match="a worker has no univoxel or another version"):
             list(run_jobs(client, [counting(tmp_path, "mug")], 1))
 
 
@@ -324,7 +324,7 @@ def test_records_that_are_broken_or_of_a_former_version(tmp_path):
     assert job.record() == {"identity": {}, "seconds": {}, "errors": {}}
     for text in ("[]", '{"seconds": 3}'):
         job.file(".json").write_text(text)
-        with pytest.raises(DataError, match=r"mug\.json: not a record of a job: remove"):
+        with pytest.raises(DataError, match=r"mug\.json: expected the record of a job: remove"):
             job.record()
         assert "record of a job" in run_job(job).errors["files"]
     fields = {"identity": {"seed": 1}, "seconds": {"count": 3.0}, "errors": {"count": "x"}}

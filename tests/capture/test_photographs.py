@@ -235,7 +235,7 @@ def test_where_photographs_lie(tmp_path):
     (tmp_path / "x/images").rename(tmp_path / "x/DCIM")
     assert len(find_photographs(tmp_path / "x")[0]) == 1
     (tmp_path / "x/preview.jpg").unlink()
-    with pytest.raises(DataError, match="got none, but some in DCIM: pass that folder, or put all"):
+    with pytest.raises(DataError, match="got none, but DCIM has some: pass that folder"):
         find_photographs(tmp_path / "x")
 
 
@@ -326,7 +326,7 @@ def test_masks_that_do_not_fit_are_refused(tmp_path):
 
 def test_one_photograph_is_too_few(tmp_path):
     quarters().save(tmp_path / "a.jpg")
-    with pytest.raises(DataError, match="at least two photographs, can read 1"):
+    with pytest.raises(DataError, match="at least two readable photographs, got 1"):
         gather([tmp_path / "a.jpg"], None)
 
 

@@ -130,7 +130,7 @@ def test_other_photographs_are_refused(captured, photographs, tmp_path):
         (fewer, "IMG_03.jpg is missing"),
         (other, "IMG_04.jpg has changed"),
     ):
-        with pytest.raises(ExistingFile, match=f"holds a capture of IMG_00.jpg and 10 .*{why}"):
+        with pytest.raises(ExistingFile, match=f"contains a capture of IMG_00.jpg and 10 .*{why}"):
             capturing.make((folder, masks), out)
     moved = tmp_path / "moved"
     shutil.copytree(photos, moved)  # the same photographs elsewhere
@@ -142,7 +142,7 @@ def test_other_photographs_are_refused(captured, photographs, tmp_path):
 def test_what_other_options_made_is_refused(captured, photographs):
     out, (photos, masks) = captured.page.parent, photographs
     options: dict[str, Any] = {"config": capturing.CONFIG, "pictures": capturing.PICTURES}
-    with pytest.raises(ExistingFile, match=r"cut was made with masks=.*remove it and"):
+    with pytest.raises(ExistingFile, match=r"cut was made with masks=.*remove this folder and"):
         task.capture(photos, out, **options)
     options |= {"masks": masks, "changes": capturing.CHANGES}
     choices: list[dict[str, Any]] = [
@@ -287,7 +287,7 @@ def test_masks_come_from_a_network_or_else_from_depth(
     with caplog.at_level("INFO"):
         task.capture(pictures, tmp_path / "mug")
     assert steps[1] == ("cutout", tmp_path / "mug/scene", "rembg" if there else "none")
-    assert ("the object is found by depth only" in caplog.text) != there
+    assert ("masks are made from depth only" in caplog.text) != there
 
 
 def test_masks_of_ones_own_go_on(steps, pictures, tmp_path):
@@ -319,7 +319,7 @@ def test_another_network_makes_other_masks(steps, pictures, tmp_path, monkeypatc
     assert steps[1:] == [("cutout", out / "scene", "rembg", "u2net")]
     assert named == ["u2net"]
     task.find_data(pictures, out, masks="rembg", network="u2net")  # goes on
-    with pytest.raises(ExistingFile, match=r"with masks=rembg, network=u2net: .*remove it and"):
+    with pytest.raises(ExistingFile, match=r"with masks=rembg, network=u2net: .*this folder and"):
         task.find_data(pictures, out, masks="rembg")
     other = tmp_path / "other"
     task.find_data(pictures, other, masks="rembg")
@@ -337,7 +337,7 @@ def test_another_box_makes_other_masks(steps, pictures, tmp_path, monkeypatch):
     with pytest.raises(ExistingFile, match=said):
         task.find_data(pictures, out, masks="none", box=box)
     scene = task.SCENE
-    with pytest.raises(UserError, match="has masks already, so box would have no effect"):
+    with pytest.raises(UserError, match="already has masks, so box would have no effect"):
         task.find_data(scene, tmp_path / "other", box=box)
 
 
@@ -367,7 +367,7 @@ def test_the_first_steps_alone(steps, pictures, tmp_path):
     assert [name for name, *_ in steps] == ["poses", "cutout"]
     assert task.capture(pictures, out, masks="none").page.exists()  # goes on with them
     assert [name for name, *_ in steps] == ["poses", "cutout", "train"]
-    with pytest.raises(UserError, match="is a trained run, which has cameras and masks"):
+    with pytest.raises(UserError, match="is a trained run, so until must be page"):
         task.find_data(out / "run", tmp_path / "other")
 
 
@@ -378,7 +378,7 @@ def test_a_capture_of_version_0_2_is_gone_on_with(steps, pictures, tmp_path):
     (out / "steps.json").unlink()
     (out / "capture.json").write_text(json.dumps({"kind": "photographs", **noted}))
     (pictures / "3.png").touch()
-    with pytest.raises(ExistingFile, match=r"holds a capture of 0.png .*3.png is new"):
+    with pytest.raises(ExistingFile, match=r"contains a capture of 0.png .*3.png is new"):
         task.capture(pictures, out, masks="none")
     (pictures / "3.png").unlink()
     with pytest.raises(ExistingFile, match="was made with masks=none"):
@@ -407,7 +407,7 @@ def test_a_turntable_gets_masks_first(steps, pictures, tmp_path, monkeypatch, ca
         ("cutout", out / "scene", out / "scene" / "masks"),
         ("train", (out / "cut").absolute(), False),
     ]
-    with pytest.raises(ExistingFile, match="cameras found with masks of network=u2netp: choose"):
+    with pytest.raises(ExistingFile, match="found with masks from network=u2netp: pass"):
         task.capture(pictures, out, network="u2net")
     assert "s per photograph, about 10 s for all 3" in caplog.text
     for v in range(3):
@@ -458,7 +458,7 @@ def test_a_turntable_without_anything_for_masks_is_one_line(steps, pictures, tmp
     monkeypatch.setattr("univoxel.capture.poses.poses", still)
     with pytest.raises(MissingExtra, match="needs rembg"):
         task.capture(pictures, tmp_path / "mug")
-    with pytest.raises(UserError, match="so finding cameras needs masks: expected masks=rembg"):
+    with pytest.raises(UserError, match="masks are needed to find cameras: expected masks=rembg"):
         task.capture(pictures, tmp_path / "mug", masks="none")
 
 
@@ -492,7 +492,7 @@ def test_what_cannot_be_begun_leaves_nothing(steps, pictures, tmp_path, monkeypa
     monkeypatch.setattr("univoxel.capture.sfm.require_pycolmap", lambda: None)
     with pytest.raises(ExistingFile, match="is a file"):
         task.capture(pictures, out)
-    with pytest.raises(ExistingFile, match=r"holds other files \(0.png\): choose another out"):
+    with pytest.raises(ExistingFile, match=r"contains other files \(0.png\): choose another"):
         task.capture(pictures, pictures)
 
 

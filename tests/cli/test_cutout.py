@@ -73,7 +73,7 @@ def test_what_is_written_can_be_trained_on(tmp_path, caplog, by_brightness):
         torch.testing.assert_close(cut.cameras.camera_to_world, source.cameras.camera_to_world)
         for view in range(count):  # each mask with its photograph
             assert iou(cut.picture(view)[1], photograph(source.cameras, view)[1]) > 0.9
-    with pytest.raises(FileExistsError, match="cut exists already: choose another out"):
+    with pytest.raises(FileExistsError, match="cut exists already: choose another folder for out"):
         task.cutout(data, out)
 
 
@@ -118,7 +118,7 @@ def test_masks_of_a_folder_are_repaired(tmp_path, with_masks, caplog):
     assert task.cutout(data, out, folder) == out
     told = f"{VIEWS - 2} of {VIEWS} agree with the object's silhouette"
     assert told in caplog.text
-    assert "1 include something beside the object (r_5), 1 miss a part (r_2)" in caplog.text
+    assert "1 include more than the object (r_5), 1 miss part of the object (r_2)" in caplog.text
     cut = load_photos(out)
     for view, mask in enumerate(true):
         found = cut.picture(view)[1]
@@ -228,7 +228,7 @@ def test_a_box_takes_the_table_out_of_all_masks(tmp_path, room, caplog):
     folder, box = write_masks(tmp_path / "masks", masks, photos.names), (-0.5, -0.5, 0.03)
     caplog.set_level("INFO", "univoxel")
     cut = load_photos(task.cutout(data, tmp_path / "cut", folder, box=(*box, 0.6, 0.5, 1.2)))
-    assert "the object was found by masks of 20 photographs, depth on " in caplog.text
+    assert "the object was found from masks of 20 photographs, depth on " in caplog.text
     assert "% of its surface, the box; it extends from " in caplog.text
     agreed = [iou(cut.picture(view)[1], mask) for view, mask in enumerate(true)]
     assert np.mean(agreed) > 0.9

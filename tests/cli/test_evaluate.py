@@ -292,7 +292,7 @@ def broken_relit(folders):
         (lambda f: (f.run / "config.json").unlink(), r"folder of a run, but it has no"),
         (
             lambda f: (f.run / "config.json").write_text("{}"),
-            "config.json: expected data, the name of a folder",
+            "config.json: expected a folder as data",
         ),
         (lambda f: (f.run / "config.json").write_text("{"), "config.json: .* JSON"),
         (

@@ -176,7 +176,7 @@ def test_test_views_come_from_the_data_of_the_run(run):
     with pytest.raises(DataError, match=r"a run, but it has no config\.json"):
         frames(run, cameras="test")
     (run / "run" / "config.json").write_text("{}")
-    with pytest.raises(DataError, match=r"config\.json: expected data, the name of a folder"):
+    with pytest.raises(DataError, match=r"config\.json: expected a folder as data"):
         frames(run, cameras="test")
     (run / "run" / "config.json").write_text(json.dumps({"data": str(run / "none")}))
     with pytest.raises(DataError, match="none"):

@@ -112,7 +112,7 @@ def test_what_decides(photographs, monkeypatch, caplog, still_around, ahead, sav
     assert (found.turntable is not None) == turns
     assert found.flash is None
     if turns:
-        assert "a fixed light explains 0 %" in caplog.text
+        assert "a fixed light: 0 %" in caplog.text
 
 
 def test_what_is_known_is_not_looked_for(photographs):
@@ -128,7 +128,7 @@ def test_a_turntable_without_an_axis(photographs):
         [pose[::2, :, 1], -pose[::2, :, 0]], 2
     )  # every other on its side
     tumbled = replace(photos, cameras=replace(photos.cameras, camera_to_world=pose))
-    with pytest.raises(DataError, match="light_frame turntable: the cameras are not around"):
+    with pytest.raises(DataError, match="light_frame=turntable needs cameras around one"):
         light_frame_of(tumbled, *hull_of(photos), "turntable")
     assert light_frame_of(tumbled, *hull_of(photos), "auto") == LightFrame()
 
@@ -248,7 +248,7 @@ def test_a_checkpoint_keeps_the_axes(laid, tmp_path):
             {"light": EnvmapConfig()},
             r"needs hybrid or a local .* model \(sg, sh or mlp\), got envmap",
         ),
-        ({"varying": "light"}, "cannot vary as well"),
+        ({"varying": "light"}, "cannot also differ"),
     ],
 )
 def test_what_does_not_go_with_a_turntable(changes, message):

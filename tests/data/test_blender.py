@@ -231,10 +231,10 @@ BROKEN = {
     "a list": (text(b"[1, 2]"), r"expected a JSON object, got \[1, 2\]"),
     "no frames": (root(frames=[]), r"expected a list of frames, got \[\]"),
     "frames of another kind": (root(frames={"a": 1}), "expected a list of frames, got {'a': 1}"),
-    "a frame of another kind": (root(frames=["r_0"]), "frame 0: expected an object, got 'r_0'"),
+    "a frame of another kind": (root(frames=["r_0"]), "frame 0: expected a JSON object, got 'r_0'"),
     "a frame without a path": (
         frame(file_path=None),
-        "frame 1: expected an object with a file_path",
+        "frame 1: expected text in file_path",
     ),
     "no picture": (
         lambda f: without(f, "train/r_1.png"),

@@ -84,7 +84,7 @@ def other_size(wider, higher):
 TEXT = {
     "fisheye": (
         edited("cameras.txt", lambda t: t.replace("SIMPLE_PINHOLE", "OPENCV_FISHEYE")),
-        r"cameras\.txt: expected cameras of SIMPLE_PINHOLE, .*, camera 3 is OPENCV_FISHEYE: run",
+        r"cameras\.txt: expected .* SIMPLE_PINHOLE, .*, got OPENCV_FISHEYE for camera 3: run",
     ),
     "parameters": (
         edited("cameras.txt", lambda t: t.replace("SIMPLE_PINHOLE", "PINHOLE")),
@@ -100,7 +100,7 @@ TEXT = {
     ),
     "camera": (
         edited("images.txt", lambda t: t.replace(" 3 p_004", " 9 p_004")),
-        r"images\.txt: p_004\.png has no camera 9",
+        r"images\.txt: camera 9 of p_004\.png does not exist",
     ),
     "line": (
         edited("images.txt", lambda t: t.replace(" 3 p_004.png", "")),

@@ -273,7 +273,7 @@ def two_fit(folder):
         (
             write_nerfstudio,
             no_images("images", "images_2"),
-            "images_2 exists: rename it to images, and the cameras are scaled",
+            "images_2 exists: rename it to images, so that cameras are scaled",
         ),
         (
             write_polycam,

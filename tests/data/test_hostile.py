@@ -47,7 +47,7 @@ def moved(place: object):
         (lambda r: [r.pop("fl_x"), r.update(camera_angle_x=3.14159265)], "expected focal lengths"),
         (moved(GIANT), "frame 0: expected a finite 4x4 transform_matrix, got"),
         (moved(1e308), r"frame 0: expected matrix values up to 1e\+09, got 1e\+308"),
-        (lambda r: r["frames"][0].update(file_path="a\0b"), "expected an object with a file_path"),
+        (lambda r: r["frames"][0].update(file_path="a\0b"), "expected text in file_path"),
         (lambda r: r["frames"][0].update(mask_path="a\0b"), "frame 0: the mask"),
     ],
 )

@@ -127,7 +127,7 @@ def leaning(arrays):
             "world_mat_2: expected cx between -12 and 24, got 300",
         ),
         (edited(lambda a: a.pop("world_mat_9")), "expected a world_mat for each of 10"),
-        (lambda f: (f / "image").rename(f / "photos"), "npz: no images in .*image"),
+        (lambda f: (f / "image").rename(f / "photos"), "npz: expected images in .*image, f"),
         (
             lambda f: write_png(f / "mask" / "p_003.png", np.ones((4, 4), np.uint8)),
             "p_003.png: expected 12x8 pixels, got 4x4",

@@ -104,7 +104,7 @@ def test_downscales_out_of_range(tmp_path):
     write_nerf(tmp_path, scene())
     with pytest.raises(ValueError, match="downscale must be at least 1, got -1"):
         load_photos(tmp_path, downscale=-1)
-    with pytest.raises(DataError, match="downscale=9 leaves no pixel of 12x8"):
+    with pytest.raises(DataError, match="downscale=9 is too large for 12x8"):
         load_photos(tmp_path, downscale=9)
 
 

@@ -300,7 +300,7 @@ def test_soft_masks_stay_as_they_are(tmp_path):
 )
 def test_pictures_that_say_nothing_of_one_object(tmp_path, picture, message):
     picture.save(tmp_path / "a.png")
-    with pytest.raises(DataError, match=rf"a\.png: expected a mask.*{message}.*: give masks that"):
+    with pytest.raises(DataError, match=rf"a\.png: expected a mask.*{message}.*: use masks that"):
         coverage_in(tmp_path / "a.png")
 
 

@@ -88,7 +88,7 @@ SENSOR = '<sensor id="3" label="unknown" type="frame">'
             "expected one chunk, got 0",
         ),
         (edited(("transform>", "other>")), "xml: expected cameras with a transform, got 11"),
-        (edited((SENSOR, '<sensor id="4">')), "sensor 3 of p_000: its sensor is not listed"),
+        (edited((SENSOR, '<sensor id="4">')), "sensor 3 of p_000: this sensor is not listed"),
         (edited((SENSOR, '<sensor id="3" type="fisheye">')), "expected a sensor of type frame"),
         (edited(("calibration", "other")), "sensor 3 of p_000: expected a calibration, found none"),
         (edited(("<f>11.0</f>", "")), "sensor 3 of p_000: expected a number as f, got nothing"),

@@ -64,7 +64,7 @@ def test_splits_that_name_what_is_not_there(tmp_path):
     (data / "images" / "p_002.png").unlink()
     assert load_photos(data).names == ["p_001"]
     (data / "images" / "p_003.png").unlink()
-    with pytest.raises(DataError, match="frames with images in test_filenames, got none of 1"):
+    with pytest.raises(DataError, match="frames in test_filenames, found none of 1"):
         load_photos(data, "test")
 
 

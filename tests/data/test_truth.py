@@ -100,7 +100,7 @@ def test_relit_views(tmp_path):
 
 def test_broken_relit_views(tmp_path):
     (tmp_path / "relight" / "city").mkdir(parents=True)
-    with pytest.raises(DataError, match=r"city: expected its environment map .*city\.hdr, but"):
+    with pytest.raises(DataError, match=r"city: expected the environment map .*city\.hdr, but"):
         relight_maps(tmp_path)
     with pytest.raises(DataError, match=r"relight/city: the image .*r_0 does not exist"):
         load_relit(photos(tmp_path), "city")

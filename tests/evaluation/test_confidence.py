@@ -184,7 +184,7 @@ def test_words_leave_out_what_is_not_the_case(surveyed):
     assert "differs" not in said
     assert "Photographs cannot separate the brightness" in said
     assert "trouble" not in said
-    assert "recovered 2 times, last in stage 1: b." in words(figures, ["a", "stage 1: b"])
+    assert "recovered: 2. The last one: stage 1: b." in words(figures, ["a", "stage 1: b"])
 
 
 def test_points_lie_on_the_sphere(surveyed):

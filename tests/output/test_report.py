@@ -215,7 +215,7 @@ def test_what_time_cut_is_told(tmp_path):
     told = report.remarks(cfg, state)
     assert told[0] == "Training has not ended: it is in stage 4."
     assert "(completed steps: 40% of shape)" in told[1]
-    assert "recovered 1 times, last in a." in told[2]
+    assert "recovered: 1. The last one: a." in told[2]
     assert report.stage_ends({}) == []
     assert report.prepared({}) is None
 
@@ -259,7 +259,7 @@ def test_a_run_whose_photographs_are_gone_shows_what_is_left(run, data, tmp_path
     assert re.findall(r"<h2>(.*?)</h2>", text) == [
         *("Result", "What to photograph next", "Materials", "Light", "Training")
     ]
-    assert "This training has no log" in text
+    assert "because this run has no log" in text
     # Where they are now
     whole = report_text(moved, scene, state, ReportOptions(size=SIZE, data=data, views=0))
     assert "<li>" in section(whole, "What to photograph next")

@@ -151,7 +151,7 @@ def test_a_training_is_ended_from_a_browser(data, tmp_path, looking, caplog):
     assert state["made"][1:] == [1.0, 1.0]
     assert len(scene.field.isosurface()[0]) > 100
     assert "Mean uncertainty over the surface" in (run / "trust.txt").read_text()
-    assert "Result: unfinished, it was stopped (completed steps:" in caplog.text
+    assert "Result: unfinished, training was stopped (completed steps:" in caplog.text
 
 
 def test_light_that_varies_and_cameras_that_move(data, tmp_path, looking, monkeypatch):

@@ -84,7 +84,7 @@ class Job:
         path = self.file(".json")
         found = read_json(path) if path.exists() else {}
         if not isinstance(found, dict) or any(type(found.get(k, {})) is not dict for k in RECORD):
-            raise DataError(f"{path}: not a record of a job: remove the file")
+            raise DataError(f"{path}: expected the record of a job: remove this file")
         return {key: found.get(key, {}) for key in RECORD}
 
     def save(self, record: dict[str, dict[str, Any]]) -> None:
@@ -96,8 +96,10 @@ class Job:
         before = self.record()["identity"]
         other = [key for key, value in self.identity.items() if before and before.get(key) != value]
         if other:
-            where = f"{self.name}: {self.file('.json')} was written for other {' and '.join(other)}"
-            hint = "choose another out, or remove that file and the folder of its results"
+            where = f"{self.name}: {self.file('.json')} has other values of {' and '.join(other)}"
+            hint = (
+                "choose another folder for out, or remove that file and the folder of its results"
+            )
             raise ExistingFile(f"{where}: {hint}", "out")
 
 
@@ -141,7 +143,7 @@ def _steps(job: Job, watch: Callable[[Step], None]) -> tuple[Any, dict[str, str]
         code, said = _run(job, step, watch)
         seconds[step.name] = seconds.get(step.name, 0.0) + time.monotonic() - begin
         if (cause := system.ended_by(code)) is not None:
-            errors[step.name] = f"ended by {cause}; the system does this when memory runs out"
+            errors[step.name] = f"killed ({cause}); the system does this when memory runs out"
         elif code:
             errors[step.name] = said or f"ended with exit code {code}"
         elif step.makes is not None and not step.makes.exists():
@@ -315,13 +317,13 @@ def _result(future: Any, job: Job) -> Result:
     from distributed import KilledWorker
 
     if future.status in ("lost", "cancelled"):
-        raise ProcessFailed("lost contact with the scheduler: run the same command again to resume")
+        raise ProcessFailed("lost the connection to the scheduler: run the command again to resume")
     error = future.exception()
     if error is None:
         return future.result()
     if isinstance(error, KilledWorker):
         return Result(job.name, "failed", {"worker": "every worker that took this scene died"})
-    raise ProcessFailed(f"a worker lacks univoxel or has another version of it: {error}") from error
+    raise ProcessFailed(f"a worker has no univoxel or another version of it: {error}") from error
 
 
 class ProgressTable:

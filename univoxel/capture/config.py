@@ -22,14 +22,14 @@ class CaptureConfig:
     features: int = setting(4096, "maximum number of features per photograph", least=64)
     first_octave: int = setting(
         -1,
-        "first octave of the scale space: -1 doubles the image first; 0 takes a quarter of the "
-        "time but may lose photographs of smooth objects",
+        "first octave of the scale space: -1 first enlarges images twofold; 0 takes a quarter of "
+        "the time but may lose photographs of smooth objects",
         least=-1,
     )
     seed: int = setting(0, "random seed", least=0)
     exhaustive: int = setting(
         24,
-        "up to this number of photographs, all pairs are matched; beyond, only similar ones",
+        "up to this number of photographs, match all pairs; of more, match only similar pairs",
         least=2,
     )
     partners: int = setting(16, "number of similar photographs to match with each one", least=1)

@@ -184,7 +184,7 @@ def cutout(
     """
     data, out, origin = Path(data), Path(out), str(source)
     if out.exists():
-        raise ExistingFile(f"{out} exists already: choose another out", "out")
+        raise ExistingFile(f"{out} exists already: choose another folder for out", "out")
     check_masks(origin, network, box, keep_table)
     corners = None if box is None else object_shape.box_corners(box)
     masked = mask_network(network) if origin == REMBG else None
@@ -228,7 +228,7 @@ def check_masks(origin: str, network: str, box: Sequence[float] | None, keep_tab
     if keep_table and (box is None or origin != DEPTH):
         got = "no box" if box is None else f"masks from {origin}"
         raise UserError(
-            f"keep_table needs masks from depth ({DEPTH}) and a box in which the table ends, got "
+            f"keep_table needs masks from depth ({DEPTH}) and a box that bounds the table, got "
             f"{got}",
             "keep_table",
         )
@@ -240,13 +240,13 @@ def _from_depth(
     """Masks of what stands out in depth."""
     small = masks_by_depth(maps, box, keep_table)
     if small is None and box is not None:
-        raise object_shape.nothing_inside(box, "depth was found for no surface", maps.cameras)
+        raise object_shape.nothing_inside(box, "no surface has a known depth", maps.cameras)
     shape = None if small is None else object_shape.find_object(small, maps, FINE, box)
     if shape is None or shape.surface < GUESSED:
         raise DataError(
-            f"{splits['train'].folder}: depth separates no object from its surroundings. Depth "
-            f"needs texture and cameras all around the object; otherwise, use source={REMBG} or a "
-            f"folder of masks instead of {DEPTH}",
+            f"{splits['train'].folder}: depth does not separate the object from its surroundings. "
+            f"Depth needs texture and cameras all around the object; otherwise, use source={REMBG} "
+            f"or a folder of masks instead of {DEPTH}",
             "source",
         )
     _tell_evidence(shape, 0, box)
@@ -276,7 +276,7 @@ def _tell_evidence(shape: object_shape.ObjectShape, count: int, box: Tensor | No
     lower, upper = (
         object_shape.words_of(corner.tolist()) for corner in object_shape.inside_bounds(shape)
     )
-    log.info(f"the object was found by {', '.join(by)}; it extends from {lower} to {upper}")
+    log.info(f"the object was found from {', '.join(by)}; it extends from {lower} to {upper}")
 
 
 def _silhouettes_of(shape: object_shape.ObjectShape, photos: Photos) -> list[Tensor]:
@@ -357,7 +357,7 @@ def _judged(
     wrong = sum(bool(v.fault) and (box is None or v.fault == MISSING) for v in verdicts["train"])
     told = _told(splits, verdicts, usual)
     if 2 * wrong > count and shape.surface < SURE:
-        told += ": none is corrected, because the shape may be wrong instead"
+        told += ": no mask is corrected, because the shape may be wrong instead"
         log.warning(
             f"{told}. Either all masks have the same fault or the cameras are wrong: check "
             "masks.html"
@@ -386,7 +386,7 @@ def _told(splits: dict[str, Photos], verdicts: dict[str, list[Verdict]], usual: 
     if not wrong:
         return told
     parts = []
-    said = {BESIDE: "include something beside the object", MISSING: "miss a part"}
+    said = {BESIDE: "include more than the object", MISSING: "miss part of the object"}
     for fault, words in said.items():
         if stems := faults[fault]:
             parts.append(f"{len(stems)} {words} ({some(stems)})")

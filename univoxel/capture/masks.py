@@ -159,7 +159,7 @@ LEAST = 0.75
 # Voxels beside the silhouette within which a repaired mask keeps its own edge
 BAND = 1.5
 
-BESIDE, MISSING = "keeps something beside the object", "misses a part"
+BESIDE, MISSING = "includes more than the object", "misses part of the object"
 
 
 @dataclass(frozen=True)

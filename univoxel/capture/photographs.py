@@ -109,7 +109,7 @@ def find_photographs(folder: Path) -> tuple[list[Path], list[str], int]:
     where = ", ".join(str(p.relative_to(folder)) for p in inner[:NAMED])
     raise DataError(
         f"{folder}: expected photographs ({' '.join((*PLAIN, *HEIF))} or RAW), got none"
-        + (f", but some in {where}: pass that folder, or put all into one folder" if inner else "")
+        + (f", but {where} has some: pass that folder, or put all into one folder" if inner else "")
     )
 
 
@@ -359,7 +359,7 @@ def _to_jpeg(video: Path, folder: Path) -> str:
         _write_table(folder / TABLE, stated, curve)
         table = f",lut3d=file={TABLE}:interp=tetrahedral"
     if curve in HDR:
-        said = "%s: %s colours (HDR) were tone mapped, which clips all that exceeds white paper"
+        said = "%s: %s colours (HDR) were tone mapped, which clips all that is brighter than white"
         log.warning(said, video.name, HDR[curve])
     exact = "flags=bicubic+accurate_rnd+full_chroma_int"
     return (

@@ -84,7 +84,7 @@ def poses(
     Raises:
         MissingExtra: pycolmap or the reader of a format is missing.
         DataError: photographs cannot be used, or too few can be registered. StillBackground: the
-            object was turned before a static camera, and there are no masks.
+            object was rotated in front of a static camera, and there are no masks.
         ExistingFile: out holds something else.
         ProcessFailed: a step failed.
         OSError: a file cannot be written.
@@ -165,7 +165,8 @@ def _check_free(out: Path, folders: Folders) -> None:
     begun = scene.WRITTEN if steps.recorded(folders.work, SEARCH) else ()
     foreign = [p.name for p in out.iterdir() if p.name not in (WORK, scene.PARTIAL, *begun)]
     if foreign:
-        raise ExistingFile(f"{out} holds other files ({foreign[0]}): choose another out", "out")
+        where = f"{out} contains other files ({foreign[0]})"
+        raise ExistingFile(f"{where}: choose another folder for out", "out")
 
 
 def photographs_of(
@@ -184,7 +185,7 @@ def photographs_of(
         return sorted(folders.frames.glob("*.jpg")), [], 0
     if every is not None:
         raise DataError(
-            f"{source}: every is for videos only ({' '.join(photographs.SUFFIXES)})", "every"
+            f"{source}: every works only with videos ({' '.join(photographs.SUFFIXES)})", "every"
         )
     if not source.is_dir():
         raise DataError(f"{source}: expected a folder of photographs or a video")
@@ -209,7 +210,7 @@ def _settings(
 def _begin(out: Path, folders: Folders, settings: dict, written: dict) -> bool:
     """Begin a search, or continue with it; whether all is done already."""
     if (out / scene.REPORT).exists():
-        other = ExistingFile(f"{out} holds another scene: choose another out", "out")
+        other = ExistingFile(f"{out} contains another scene: choose another folder for out", "out")
         if not steps.done(folders.work, SEARCH, settings, lambda _: other):
             raise other
         return steps.recorded(folders.work, SCENE) == written
@@ -256,7 +257,7 @@ def _search(
         stands = f"the background is static in {still} of {matching} pairs"
         if capture.masks is None:
             raise StillBackground(stands)
-        raise DataError(f"{stands}, and the masks include part of it: make them tighter", "masks")
+        raise DataError(f"{stands}, and masks include part of it: make the masks tighter", "masks")
     do(MODELS, structure.place, total)
     return unreadable
 
@@ -335,8 +336,8 @@ def _say(capture: Capture, found: Found, total: int, keep_weak: bool) -> None:
     if weak:
         fate = "kept" if keep_weak else "left out (keep_weak keeps them)"
         log.warning(
-            f"the poses of {len(weak)} may be wrong by degrees, {fate}: {_some(weak)}; photograph "
-            "that side again with more overlap",
+            f"{len(weak)} photographs, whose poses may be wrong by several degrees, are {fate}: "
+            f"{_some(weak)}. Photograph that side again with more overlap",
             extra={"arguments": ("keep_weak",)},
         )
 

@@ -64,7 +64,7 @@ def gather(files: Sequence[Path], masks: Path | None) -> tuple[Capture, list[str
             unread.append(path.name)
     if len(photographs) < 2:
         raise DataError(
-            f"{files[0].parent}: expected at least two photographs, can read {len(photographs)}"
+            f"{files[0].parent}: expected at least two readable photographs, got {len(photographs)}"
         )
     named = [(photograph.name, photograph.path) for photograph in photographs]
     found = None if masks is None else masks_in(masks, named)

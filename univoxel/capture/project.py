@@ -75,7 +75,7 @@ def begin(project: Project, given: Given) -> None:
     """
     out = project.out
     if out.exists() and not out.is_dir():
-        raise ExistingFile(f"{out} is a file: choose another out", "out")
+        raise ExistingFile(f"{out} is a file: choose another folder for out", "out")
     if (out / RECORD_0_2).exists():
         before = read_json(out / RECORD_0_2)
         files.adopt(out, {step: before[step] for step in ("files", *FACTS) if step in before})
@@ -83,14 +83,16 @@ def begin(project: Project, given: Given) -> None:
     def other(files: list) -> ExistingFile:
         why = _difference(files, given.files)
         return ExistingFile(
-            f"{out} holds a capture of {_words(files)}; {why}: choose another out", "out"
+            f"{out} contains a capture of {_words(files)}; {why}: choose another folder for out",
+            "out",
         )
 
     begun = files.done(out, "files", given.files, other)
     if out.exists() and not begun:
         foreign = sorted(p.name for p in out.iterdir() if p.suffix != ".tmp")
         if foreign:
-            raise ExistingFile(f"{out} holds other files ({foreign[0]}): choose another out", "out")
+            where = f"{out} contains other files ({foreign[0]})"
+            raise ExistingFile(f"{where}: choose another folder for out", "out")
     out.mkdir(parents=True, exist_ok=True)
     for path in out.rglob(".*.tmp"):  # of `files.replacing`, whose process was killed
         path.unlink()

@@ -34,15 +34,15 @@ class BatchOptions:
     steps: Annotated[tuple[choices.BatchStep, ...], parsing.written("STEP [STEP ...]")] = (
         choices.USUAL_STEPS
     )
-    """steps per scene, in this order: poses masks train eval export page"""
+    """steps to run for each scene, in this order: poses masks train eval export page"""
     masks: Annotated[str, parsing.written("auto|rembg|FOLDER|none")] = "auto"
-    """how the step masks makes them, as in capture"""
+    """source of the masks for the step masks, as in capture --masks"""
     preset: choices.PresetOrAuto = "auto"
     """amount of work, from draft to best; auto: chosen to fit --minutes, else fast"""
     light: Annotated[choices.LightName, parsing.ADVANCED] = "hybrid"
-    """lighting model; hybrid keeps shadows out of the albedo, others are to compare"""
+    """lighting model; hybrid keeps shadows out of the albedo; the others are baselines"""
     minutes: parsing.Minutes = None
-    """time limit of each training"""
+    """time limit for training each scene"""
     config: parsing.ConfigFile = None
     """reuse the config.json of another run in place of --preset and --light"""
     changes: parsing.Changes = ()
@@ -56,7 +56,7 @@ class BatchOptions:
     tries: Annotated[int, parsing.ADVANCED] = 3
     """number of attempts at a scene whose process is killed"""
     json: parsing.JsonFile = None
-    """also write the contents of batch.json to a file; - prints them, not the table"""
+    """also write the contents of batch.json to a file; - prints them in place of the table"""
 
     def training(self) -> TrainConfig:
         """The configuration of a training; a UserError if there is none of that kind."""
@@ -97,8 +97,8 @@ def command(asked: BatchOptions) -> None:
 
     Each step of a scene runs in its own process, so a crash does not affect the other scenes.
     Finished steps are kept: run the same command again to resume, or to retry failed scenes.
-    NIGHT/index.html shows all scenes, batch.json and batch.csv hold their metrics, NIGHT/SCENE the
-    results and NIGHT/logs the logs. If a scene fails, the exit code is 2.
+    NIGHT/index.html shows all scenes, and batch.json and batch.csv list their metrics. The results
+    of a scene are in NIGHT/SCENE, and all logs in NIGHT/logs. If a scene fails, the exit code is 2.
     """
     import rich
 
@@ -142,7 +142,7 @@ def batch(asked: BatchOptions, threads: int | None = None) -> list[SceneResult]:
     if asked.scheduler is None:
         here = (machine.cores(), machine.memory())
         jobs, threads = share(known.values(), config, *here, jobs, threads)
-        log.info("%d scenes at a time, %d threads each", jobs, threads)
+        log.info("%d scenes at a time, with %d threads each", jobs, threads)
     elif jobs is not None:
         raise UserError("expected jobs or scheduler, but not both", "jobs", "scheduler")
     every = [job_of(name, data, asked, threads) for name, data in known.items()]

@@ -40,7 +40,7 @@ STEPS = ("cameras", "masks", "training", "mesh", "pictures", "page")
 @dataclass(frozen=True)
 class CaptureOptions:
     photographs: Annotated[Path, written("PHOTOS", positional=True)]
-    """folder of photographs, video, posed data set, or folder of a trained run"""
+    """folder of photographs, video, data set with cameras, or folder of a trained run"""
     out: Annotated[Path, written("DIR")]
     """folder to write scene/, cut/, run/, pictures/, the mesh and the page to"""
     masks: Annotated[str, written("auto|rembg|FOLDER|none")] = AUTO
@@ -54,13 +54,13 @@ class CaptureOptions:
     preset: choices.PresetOrAuto = "auto"
     """amount of work, from draft to best; auto: chosen to fit --minutes, else fast"""
     light: Annotated[choices.LightName, ADVANCED] = "hybrid"
-    """lighting model; hybrid keeps shadows out of the albedo, others are to compare"""
+    """lighting model; hybrid keeps shadows out of the albedo; the others are baselines"""
     minutes: Minutes = None
-    """time limit of the training; finding cameras and making masks takes extra time"""
+    """time limit for training; finding cameras and making masks takes extra time"""
     changes: Changes = ()
     """change one configuration field, such as loss.radiance=0.5; repeatable"""
     until: choices.Until = "page"
-    """last step to run; cameras and masks stop before training and print the folder"""
+    """last step to run; cameras, masks: stop before training and print the folder"""
 
     @property
     def fingerprint(self) -> Any:
@@ -118,7 +118,7 @@ PICTURES = PicturesConfig()
 
 @dataclass(frozen=True)
 class Captured:
-    """What a capture leaves: the pages and files to open."""
+    """The results of a capture: the page and files to open."""
 
     page: Path
     mesh: Path  # .glb
@@ -136,8 +136,8 @@ def capture(
 ) -> Captured:
     """Turn photographs into a relightable object, in steps whose results are kept.
 
-    The folder `out` then has scene/ (photographs and cameras), cut/ (the same with masks), run/
-    (the training), pictures/ (the object under new light, and metrics), the mesh and index.html.
+    The folder `out` gets scene/ (photographs and cameras), cut/ (the same with masks), run/ (the
+    trained run), pictures/ (the object under new light, and metrics), the mesh and index.html.
     Finished steps are kept: after an interruption, call the function again to resume. If you
     already have cameras, masks or a run, the steps that make them are skipped.
 
@@ -189,7 +189,7 @@ def capture(
     else:
         if not (project.run / FILE).exists():
             seconds = slowdown(training) * sum(map(expected_seconds, training.stages))
-            said = f"the training takes about {duration(seconds)} on this machine"
+            said = f"training takes about {duration(seconds)} on this machine"
             log.info(f"{said}, in addition to the time for cameras and masks")
         scene = _find_cameras(project, given, asked, config)
         data = _find_masks(project, scene, asked)
@@ -218,7 +218,7 @@ def find_data(
     asked = CaptureOptions(Path(photographs), Path(out), **options)
     given, project = look_at(asked.photographs), Project(asked.out)
     if given.kind == "run":
-        raise UserError(f"{given.path} is a trained run, which has cameras and masks", "until")
+        raise UserError(f"{given.path} is a trained run, so until must be page", "until")
     _check_machine(given, asked)
     begin(project, given)
     _check_network(project, asked)
@@ -275,7 +275,8 @@ def _check_network(project: Project, asked: CaptureOptions) -> None:
 
     def other(before: str) -> ExistingFile:
         return ExistingFile(
-            f"{project.out} holds cameras found with masks of network={before}: choose another out",
+            f"{project.out} contains cameras that were found with masks from network={before}: "
+            "pass that network, or choose another folder for out",
             *("network", "out"),
         )
 
@@ -331,8 +332,8 @@ def _masks_before_cameras(project: Project, given: Given, asked: CaptureOptions)
         return project.masks
     if masks == choices.DEPTH:
         raise UserError(
-            f"{given.path}: the background is static, as on a turntable, so finding cameras needs "
-            f"masks: expected masks={choices.REMBG} or a folder of masks, got {masks}",
+            f"{given.path}: the background is static, as on a turntable, so masks are needed to "
+            f"find cameras: expected masks={choices.REMBG} or a folder of masks, got {masks}",
             "masks",
         )
     _say("masks", "from a network, for each photograph")
@@ -370,7 +371,8 @@ def _find_masks(project: Project, scene: Path, asked: CaptureOptions) -> Path:
         made = {k: " ".join(map(str, v)) if k == "box" else v for k, v in made.items()}
         words = ", ".join(f"{name}={value}" for name, value in made.items())
         return ExistingFile(
-            f"{project.cut} was made with {words}: to make it again, remove it and {project.run}",
+            f"{project.cut} was made with {words}: to make it again, remove this folder and "
+            f"{project.run}",
             *made,
         )
 
@@ -382,7 +384,7 @@ def _find_masks(project: Project, scene: Path, asked: CaptureOptions) -> Path:
     if masks == AUTO and not turned and _have_masks(project, scene):
         if asked.box is not None:
             raise UserError(
-                f"{scene} has masks already, so box would have no effect. To make new masks inside "
+                f"{scene} already has masks, so box would have no effect. To make new masks inside "
                 f"the box, pass masks={choices.REMBG}, masks={choices.DEPTH} or a folder of masks",
                 "masks",
             )
@@ -412,7 +414,7 @@ def _network_or_depth(name: choices.NetworkName) -> str:
     except MissingExtra as missing:
         if name != choices.NETWORK:  # which nobody names for nothing
             raise
-        log.info(f"no mask network is installed, so the object is found by depth only ({missing})")
+        log.info(f"no mask network is installed, so masks are made from depth only ({missing})")
         return choices.DEPTH
     return choices.REMBG
 
@@ -465,8 +467,8 @@ def _check_trained(wanted: TrainConfig, done: bool) -> None:
         same = False
     if not same:
         raise ExistingFile(
-            f"{wanted.out} was trained with other values of preset, minutes, light or set: remove "
-            "it to train again, or choose another out",
+            f"{wanted.out} was trained with other values of preset, minutes, light or set: to "
+            "train again, remove that folder or choose another folder for out",
             *("preset", "minutes", "light", "set", "out"),
         )
 
@@ -536,7 +538,7 @@ def _write_page(project: Project, given: Given, run: Path) -> None:
         run,
         project.page,
         title=project.out.absolute().name,
-        notes=f"Made from {given.words}. The same folder holds {', '.join(named)}.",
+        notes=f"Made from {given.words}. The same folder contains {', '.join(named)}.",
         measures=in_words(known),
         **page_options(run),
     )

@@ -18,7 +18,7 @@ MINUTES = 2.0  # of training: the whole takes less than twice that on two cores
 
 TITLE = "Half an avocado and a bell pepper"
 NOTES = (
-    "Trained on {photos} photographs on this machine's CPU. The same folder holds the run "
+    "Trained on {photos} photographs on this machine's CPU. The same folder contains the run "
     "(run/), its surface (mesh.ply), the test views beside the ground truth "
     "(test/contact_sheet.png), and the test views under two environment maps that training "
     "never saw (relight/)."
@@ -28,7 +28,7 @@ NOTES = (
 @dataclass(frozen=True)
 class DemoOptions:
     out: Annotated[Path, written("DIR")] = Path("univoxel-demo")
-    """folder to write to; then open DIR/index.html"""
+    """folder to write to; when done, open DIR/index.html in a browser"""
 
 
 @takes(DemoOptions)

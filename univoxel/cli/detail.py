@@ -62,7 +62,7 @@ def command(asked: DetailOptions) -> Path | None:
     data = None if asked.data is None else Path(asked.data)
     made = write(load_scene(run), photos_of(run, data, "train"), run, asked.size)
     if made is None:
-        log.info("%s: no detail added: the photographs are no finer than the grid", run)
+        log.info("%s: no texture added, because photographs are no finer than the grid", run)
     return made
 
 
@@ -102,10 +102,10 @@ def made_after_training(
     if detail == "none":
         return None
     if until is not None and time.monotonic() > until:
-        log.info("detail: no time was left for it; add it with `univoxel detail %s`", run)
+        log.info("detail: no time was left for the texture; add it with `univoxel detail %s`", run)
         return None
     try:
         return write(scene, photos, run)
     except (UserError, OSError, ValueError) as error:  # a run without it is one, too
-        log.warning("detail: not added: %s", error)
+        log.warning("detail: no texture added: %s", error)
         return None

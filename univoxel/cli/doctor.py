@@ -24,8 +24,7 @@ if TYPE_CHECKING:
 
 State: TypeAlias = Literal["good", "look", "bad"]  # bad: training is refused
 COLORS: dict[State, str] = {"good": "green", "look": "yellow", "bad": "red"}
-REINSTALL = "pip install --force-reinstall --no-deps --only-binary univoxel univoxel"
-REBUILD = f"install a wheel that has it ({REINSTALL}), or rebuild with a compiler, GLM and Embree"
+REBUILD = "rebuild univoxel with a compiler, GLM and Embree (pip install . in its source folder)"
 DEVELOPERS = {"bench", "dev", "docs", "wheel"}  # extras that no command asks for
 ENOUGH = 4 << 30  # bytes: presets on 100 photographs of about 1000 pixels stay below
 
@@ -43,7 +42,7 @@ class Finding:
 @dataclass(frozen=True)
 class DoctorOptions:
     json: JsonFile = None
-    """write the findings to a file as JSON; - prints them, not the table"""
+    """write the findings to a file as JSON; - prints them in place of the table"""
 
 
 @takes(DoctorOptions)
@@ -113,7 +112,7 @@ def openmp(runtimes: Sequence[str]) -> Finding:
     found = ", ".join(runtimes) or "none"
     if len(runtimes) <= 1:
         return Finding("OpenMP", found)
-    remedy = "several OpenMP runtimes slow each other down: import univoxel first"
+    remedy = "several OpenMP runtimes slow each other down: import univoxel before other packages"
     return Finding("OpenMP", found, "look", remedy)
 
 

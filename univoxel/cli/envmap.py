@@ -23,7 +23,7 @@ class EnvmapOptions:
     height: Annotated[int, written("ROWS")] = MAP_ROWS
     """rows of the map; it has twice as many columns"""
     light_of: LightOf = None
-    """training view whose light to write, by name or number; see train --varying"""
+    """training view (name or number) whose light to write; see train --varying"""
 
 
 @takes(EnvmapOptions)
@@ -32,9 +32,10 @@ def command(asked: EnvmapOptions) -> None:
     found = envmap(**vars(asked))
     print(asked.out)
     if found:
-        print(f"diffuse sphere under it: PSNR {found.ball_psnr:.1f} dB, after a scale per channel")
-        print(f"chrome sphere under it: PSNR {found.mirror_psnr:.1f} dB")
-        print(f"brightest directions: {found.brightest_degrees:.1f} degrees apart")
+        print("Comparison with the true map:")
+        print(f"diffuse sphere under the map: PSNR {found.ball_psnr:.1f} dB, scaled per channel")
+        print(f"chrome sphere under the map: PSNR {found.mirror_psnr:.1f} dB")
+        print(f"distance of the brightest directions: {found.brightest_degrees:.1f} degrees")
 
 
 @takes(EnvmapOptions)

@@ -34,13 +34,13 @@ class EvaluateOptions:
     save: Annotated[parsing.File | None, parsing.written("DIR", "none are written")] = None
     """folder to write the rendered images to"""
     json: parsing.JsonFile = None
-    """write the metrics to a file as JSON; - prints them, not the table"""
+    """write the metrics to a file as JSON; - prints them in place of the table"""
     samples: int = SAMPLES
     """light samples per pixel of relit images"""
     bounces: Annotated[int, parsing.ADVANCED] = BOUNCES
     """number of reflections between parts of the object in relit images"""
     light_of: parsing.LightOf = None
-    """training view whose light to render in, by name or number; see train --varying"""
+    """training view (name or number) in whose light to render; see train --varying"""
     test_every: Annotated[int | None, parsing.written("N", "the test split", advanced=True)] = None
     """use every Nth photograph as a test view; none may be a training photograph"""
     background: Annotated[Behind, parsing.ADVANCED] = "black"
@@ -78,24 +78,25 @@ def command(asked: EvaluateOptions) -> None:
 def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
     """Metrics of a trained scene on its test views, with the keys of `MEASURES`.
 
-    Arguments are the fields of `EvaluateOptions`. Pictures are compared as sRGB in [0, 1], whole
-    image, composited on black, novel views on `background`. Numbers are means over the views (and
-    maps) of numbers per view; `univoxel.evaluation.measures` and `univoxel.render.metrics` define
-    each. A measure that the data has no truth for is None. What is weakly determined is said in
-    words through the log.
+    Arguments are the fields of `EvaluateOptions`. Whole images are compared in sRGB, clipped to
+    [0, 1] and composited on black, except for novel views, which are composited on `background`.
+    Each metric is a mean over the views (and maps); `univoxel.evaluation.measures` and
+    `univoxel.render.metrics` define the metrics. A metric is None if the data set has no ground
+    truth for it. The log describes what the photographs determine weakly.
 
-    Into the folder `save` go <name>.exr of each view, contact_sheet.png, and trust.txt, what is
-    weakly determined. The channels are half floats: rgb.*, albedo.* and relit_<map>.* linear,
-    composited on black, with the albedo as it is; roughness, normal.* (world), doubt.albedo and
-    doubt.roughness in [0, 1], 0 where nothing is; alpha; depth along -Z, 0 where nothing is. With
-    `full_size` NAME_full.exr comes beside it, rgb.* and alpha at the size of the photograph, and
-    the keys of `univoxel.detail.views.FULL_MEASURES` are in the result. The
-    file `json` holds the measures; `complete` and `verdict`, how training came out, None if that
-    is not known; and the figures of trust.txt under the key trust.
+    The folder `save` gets <name>.exr for each view, contact_sheet.png, and trust.txt with that
+    description. The channels are half floats: rgb.*, albedo.* and relit_<map>.* are linear,
+    composited on black, and the albedo is not scaled; roughness, normal.* (in world space), depth
+    (along -Z), doubt.albedo and doubt.roughness (in [0, 1]) are 0 outside the object; alpha is the
+    opacity. With `full_size`, NAME_full.exr is written too, with rgb.* and alpha at the size of the
+    photograph, and the result has the keys of `univoxel.detail.views.FULL_MEASURES`. The file
+    `json` contains the metrics; `complete` and `verdict`, which are None if they are not known; and
+    the figures of trust.txt under the key trust.
 
     Raises:
         DataError: the run or the data cannot be read.
-        UserError: an argument out of range; light_of is no training view, or light does not vary.
+        UserError: an argument is out of range, light_of is not a training view, or light does not
+            vary.
         OSError: a result cannot be written.
     """
     from statistics import fmean

@@ -53,7 +53,7 @@ class ExportOptions:
     size: Annotated[float | None, written("METRES", "as photographed")] = None
     """length of the object's longest side"""
     origin: Annotated[choices.Origin, ADVANCED] = "upright"
-    """what to place at the origin; world: as in the data set; upright: the same, +Z up"""
+    """position of the origin; world: as in the data set; upright: the same, with +Z up"""
     lods: Annotated[int, written("N", advanced=True)] = 0
     """also write N coarser levels, each with a quarter of the triangles"""
 
@@ -75,7 +75,7 @@ class ExportOptions:
                 raise UserError(f"export: {name} must be {' or '.join(known)}, got {value}", name)
         for name, (low, high) in (("quality", QUALITIES), ("lods", LODS)):
             if not low <= (value := getattr(self, name)) <= high:
-                raise UserError(f"export: {name} must be {low} to {high}, got {value}", name)
+                raise UserError(f"export: {name} must be from {low} to {high}, got {value}", name)
         if self.size is not None and not 0 < self.size < math.inf:
             raise UserError(f"export: size must be above 0, got {self.size:g}", "size")
         if self.faces is not None and self.lods:

@@ -50,7 +50,7 @@ class InfoOptions:
     run: Run
     """folder of a trained run"""
     json: JsonFile = None
-    """write the numbers to a file as JSON; - prints them, not the tables"""
+    """write the numbers to a file as JSON; - prints them in place of the tables"""
     picture: Annotated[File | None, written("FILE.png", "none")] = None
     """image to write: where the grid stores features, and the size of each part"""
 
@@ -106,9 +106,9 @@ def info(asked: InfoOptions) -> dict[str, Any]:
     found["bytes"] = (run / FILE).stat().st_size
     found["cameras"] = camera_check(scene, run)
     verdict = load_verdict(run)
-    unknown = "Result: unfinished, because training has not ended. To finish it, use --resume"
+    unknown = "Result: unfinished, because training has not ended. To finish, train with --resume"
     if (run / "trust.txt").exists():
-        unknown = "Result: unknown, because a version before 0.3 trained the run"
+        unknown = "Result: unknown, because the run was trained by a version before 0.3"
     found["said"] = unknown if verdict is None else verdict.sentence()
     found["result"] = None if verdict is None else as_json(verdict)
     for path in (json, picture):

@@ -31,7 +31,7 @@ class InspectOptions:
     height: Annotated[int, written("ROWS")] = MAP_ROWS
     """rows of the environment maps in the image"""
     light_of: LightOf = None
-    """training view whose light to draw, by name or number; see train --varying"""
+    """training view (name or number) whose light to draw; see train --varying"""
 
 
 @takes(InspectOptions, gradients=False)

@@ -134,7 +134,7 @@ def parse(
     if name not in commands:
         near = difflib.get_close_matches(name, commands, n=1)
         perhaps = f"; perhaps you meant {near[0]}" if near else ""
-        raise Usage(f"no command {name!r}{perhaps}; see univoxel {prefix}--help")
+        raise Usage(f"there is no command {name!r}{perhaps}; see univoxel {prefix}--help")
     program, said = f"univoxel {prefix}{name}", io.StringIO()
     if {"-h", "--help"} & set(rest):
         print(help_of(program, commands[name]))
@@ -335,7 +335,7 @@ def completion(shell: Shell, commands: Mapping[str, Command], lab: Mapping[str, 
     """The script that makes a shell complete commands, options and their choices.
 
     Args:
-        lab: commands of the experiments; none where it is not there.
+        lab: commands of the experiments; empty if they are not available.
     """
 
     import tyro

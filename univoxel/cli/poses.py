@@ -18,7 +18,7 @@ class PosesOptions:
     out: Annotated[Path, written("SCENE")]
     """folder to write to; delete its sfm/ when you are done"""
     masks: Annotated[Path | None, written("DIR", "the whole images")] = None
-    """folder of masks; only pixels inside them count, as a turntable requires"""
+    """folder of masks inside which features are detected; required on a turntable"""
     every: Annotated[float | None, written("SECONDS", "80 frames in all")] = None
     """from each period of this length in a video, take the sharpest frame"""
     keep_size: Annotated[int, written("PIXELS", advanced=True)] = KEEP_SIZE
@@ -30,7 +30,7 @@ class PosesOptions:
     features: Annotated[int | None, written("N", "4096; with --fast: 2048", advanced=True)] = None
     """maximum number of features per photograph"""
     fast: bool = False
-    """find features four times faster, but fewer; may lose views of smooth objects"""
+    """detect fewer features, four times faster; may lose views of smooth objects"""
     seed: Annotated[int, ADVANCED] = 0
     """random seed"""
 

@@ -58,7 +58,7 @@ class RelightOptions:
     cameras: Annotated[str, written("test|orbit|FILE")] = "test"
     """test views, an orbit around the object, or a path from a transforms.json"""
     ground: Annotated[str | None, written("lowest|HEIGHT")] = None
-    """add a floor that receives shadows: its height, or the object's lowest point"""
+    """add a floor that receives shadows, at this height or below the lowest point"""
     elevation: Annotated[float, written("DEGREES", advanced=True)] = ELEVATION
     """elevation of an orbit above the horizon"""
     turn: Annotated[int | None, written("FRAMES", advanced=True)] = None
@@ -273,8 +273,7 @@ def relight_images(
 ) -> Tensor:
     """Render a trained scene under new light: [F, H, W, 4] linear RGBA, premultiplied.
 
-    Of cameras with pictures of differing sizes, the smaller ones have nothing but 0 below and to
-    the right of them.
+    If the images differ in size, the smaller ones are padded with 0 below and to the right.
 
     Args:
         run: folder of the trained scene.

@@ -101,7 +101,8 @@ def _train(
     torch.manual_seed(cfg.seed)
     if not resume and (cfg.out / FILE).exists():
         raise ExistingFile(
-            f"{cfg.out} holds a run already: pass resume, or choose another out", "resume", "out"
+            f"{cfg.out} holds a run already: pass resume, or choose another folder for out",
+            *("resume", "out"),
         )
     kept, outside = kept_photos(cfg.out, "train"), cfg.allow_outside
     photos = load_photos(cfg.data, "train", cfg.downscale, kept=kept, allow_outside=outside)
@@ -249,10 +250,11 @@ def announce(progress: Progress, photos: Photos) -> None:
     what = f"{len(photos)} photographs of {size:.2g} MP"
     clock.preparation = min(before, config.PREPARATION * clock.limit)
     if whole <= clock.limit:
-        log.info(f"{what}: about {duration(whole)} on this machine")
+        log.info(f"{what}: training takes about {duration(whole)} on this machine")
         return
     fits = max(clock.limit - clock.preparation - RESERVE_SECONDS, 0.0) / clock.planned
-    said = f"{what}: about {duration(whole)} on this machine; minutes={cfg.minutes:g} is enough "
+    said = f"{what}: training takes about {duration(whole)} on this machine"
+    said += f"; minutes={cfg.minutes:g} is enough "
     if fits < 1:
         said += f"for about {fits:.0%} of the steps"
     else:

@@ -134,7 +134,9 @@ def done(
         return before is not None
     if refusal is not None:
         raise refusal(before)
-    raise ExistingFile(f"{folder}: {step} was made with other options: choose another out", "out")
+    raise ExistingFile(
+        f"{folder}: {step} was made with other options: choose another folder for out", "out"
+    )
 
 
 def as_json(fingerprint: Any) -> Any:

@@ -74,13 +74,13 @@ def list_colmap(folder: Path, split: str) -> Listed:
     for image in images:  # all of them, before a picture is opened
         if image.name in names or not image.name or "\0" in image.name:
             raise DataError(
-                f"{images_file}: expected unique names of photographs, got another {image.name!r}"
+                f"{images_file}: expected unique, non-empty names of images, got {image.name!r}"
             )
         names.add(image.name)
     shots, missing, scaled = [], [], 0
     for image in images:
         if image.camera not in cameras:
-            raise DataError(f"{images_file}: {image.name} has no camera {image.camera}")
+            raise DataError(f"{images_file}: camera {image.camera} of {image.name} does not exist")
         path = find_photo(folder, image.name, str(images_file))
         if path is None:
             missing.append(image.name)
@@ -201,8 +201,8 @@ def _parameters(path: Path, number: int, model: str) -> int:
 
 def _unsupported(path: Path, number: int, model: str) -> DataError:
     return DataError(
-        f"{path}: expected cameras of {', '.join(SUPPORTED)}, camera {number} is {model}: run "
-        "colmap image_undistorter, or `univoxel poses` on the photographs"
+        f"{path}: expected camera models {', '.join(SUPPORTED)}, got {model} for camera {number}: "
+        "run colmap image_undistorter, or `univoxel poses` on the photographs"
     )
 
 

@@ -622,5 +622,5 @@ def _what_it_is(path: Path, error: Exception) -> str:
     with path.open("rb") as file:
         head = file.read(4)
     if head in (b"II*\0", b"MM\0*"):
-        return f"this TIFF could not be read: {error}: convert it to PNG or JPEG with 8 bits"
-    return f"it could not be read: {error}"
+        return f"but this TIFF could not be read: {error}: convert it to PNG or JPEG with 8 bits"
+    return f"but it could not be read: {error}"

@@ -577,5 +577,6 @@ def _check(folder: Path, shots: Sequence[Shot], downscale: int) -> None:
         width, height = shot.lens.width, shot.lens.height
         if downscale > min(width, height):
             raise DataError(
-                f"{folder}: downscale={downscale} leaves no pixel of {width}x{height}", "downscale"
+                f"{folder}: downscale={downscale} is too large for {width}x{height} pixels",
+                "downscale",
             )

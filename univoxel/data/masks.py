@@ -52,7 +52,7 @@ WAYS = {2: "mirrored left to right", 3: "rotated by 180 degrees", 4: "mirrored t
 WAYS |= {5: "mirrored about a diagonal", 6: "rotated by 90 degrees to the left"}
 WAYS |= {7: "mirrored about a diagonal", 8: "rotated by 90 degrees to the right"}
 BRIGHT, SOFT = 100, 100  # of 255, of an object; pixels: for colours to tell of alpha
-WHITE = "give masks that are white on the object and black elsewhere"
+WHITE = "use masks that are white on the object and black elsewhere"
 
 Named = Sequence[tuple[str, Path]]  # photographs: the name within the data set, and the file
 Claim = tuple[tuple[int, ...], Path]  # of a mask: how well it fits, lowest best, and the mask

@@ -70,8 +70,8 @@ def left_out(where: str, missing: Sequence[object], listed: int, note: str = "")
     count = f"{len(missing)} of {listed}"
     if listed - len(missing) < max(FEWEST, SHARE * listed):
         raise DataError(
-            f"{where}: missing images: {names} ({count}); expected at least half of them, and at "
-            f"least {FEWEST}{note}"
+            f"{where}: missing images: {names} ({count}); expected at least half of all images, "
+            f"and at least {FEWEST}{note}"
         )
     log.warning("%s: missing images: %s (%s left out)", where, names, count)
     return [f"{count} listed images are missing and left out"]

@@ -165,7 +165,7 @@ def _camera_pose(camera: ET.Element, world: tuple[float, np.ndarray], where: str
 def _sensor_lens(sensor: ET.Element | None, where: str) -> Lens:
     """The lens of a sensor, in the terms of OpenCV."""
     if sensor is None:
-        raise DataError(f"{where}: its sensor is not listed in the file")
+        raise DataError(f"{where}: this sensor is not listed in the file")
     if (kind := sensor.get("type", "frame")) != "frame":
         raise DataError(f"{where}: expected a sensor of type frame, got {kind}")
     calibrations = sensor.findall("calibration")

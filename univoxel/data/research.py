@@ -90,7 +90,8 @@ def _llff_pictures(folder: Path) -> list[Path]:
         if pictures := photographs_in(place):
             return pictures
     raise DataError(
-        f"{folder / LLFF_FILE}: no images in {folder / 'images'} or images_2, images_4 ..."
+        f"{folder / LLFF_FILE}: expected images in {folder / 'images'}, images_2 or images_4 etc., "
+        "found none"
     )
 
 
@@ -194,7 +195,7 @@ def _idr_pictures(folder: Path, path: Path) -> list[Path]:
     for name in IMAGES:
         if found := photographs_in(folder / name):
             return _ordered(found)
-    raise DataError(f"{path}: no images in {folder / IMAGES[0]}")
+    raise DataError(f"{path}: expected images in {folder / IMAGES[0]}, found none")
 
 
 def _ordered(pictures: list[Path]) -> list[Path]:
@@ -279,7 +280,7 @@ def list_neilf(folder: Path, split: str) -> Listed:
         raise DataError(f"{path}: expected images with cameras (flg {PLACED}), got none")
     looked = f" (looked in {folder / 'inputs' / 'images'})"
     lost = left_out(str(path), missing, len(names) - unplaced, looked)
-    lost += [f"{unplaced} photographs without a camera left out"] if unplaced else []
+    lost += [f"{unplaced} photographs left out, which have no camera"] if unplaced else []
     return turned_up(folder, split, "NeILF layout", shots, lost)
 
 

@@ -98,7 +98,7 @@ def read_transforms(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         raise DataError(f"{path}: expected a list of frames, got {short(frames)}")
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict):
-            raise DataError(f"{path}: frame {index}: expected an object, got {short(frame)}")
+            raise DataError(f"{path}: frame {index}: expected a JSON object, got {short(frame)}")
     frames = [_understood(frame) for frame in frames]
     return _understood(root), frames
 
@@ -126,7 +126,7 @@ def read_frames(path: Path) -> tuple[dict[str, Any], list[load_images.Shot], lis
     for index, frame in enumerate(frames):  # all of them, before a picture is opened
         where, file_path = f"{path}: frame {index}", frame.get("file_path")
         if not isinstance(file_path, str) or "\0" in file_path:
-            raise DataError(f"{where}: expected an object with a file_path, got {short(file_path)}")
+            raise DataError(f"{where}: expected text in file_path, got {short(file_path)}")
     names = [_name(frame, view_name(frame["file_path"])) for frame in frames]
     if len(set(names)) < len(names):
         longer = view_names([frame["file_path"] for frame in frames])
@@ -181,7 +181,7 @@ def _smaller(missing: Sequence[Path]) -> str:
     if not others:
         return ""
     return (
-        f"; {others[0]} exists: rename it to {place.name}, and the cameras are scaled to its images"
+        f"; {others[0]} exists: rename it to {place.name}, so that cameras are scaled to its images"
     )
 
 
@@ -470,8 +470,8 @@ def _named(
     names = [known.get(name) or known.get(view_name(name)) for name in chosen]
     if None in names or not names:
         came = view_name(chosen[names.index(None)]) if names else "an empty list"
-        raise DataError(f"{path}: expected only frames of the file in {key}, got {came}")
+        raise DataError(f"{path}: expected only frames of this file in {key}, got {came}")
     found = [by_name[name] for name in names if name in by_name]
     if not found:
-        raise DataError(f"{path}: expected frames with images in {key}, got none of {len(names)}")
+        raise DataError(f"{path}: expected images of frames in {key}, found none of {len(names)}")
     return found

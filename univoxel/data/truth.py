@@ -116,7 +116,7 @@ def read_ply(path: Path) -> Mesh:
         index, sides = face["corner"].astype(np.int32), face["count"]
     except (KeyError, IndexError, ValueError, OverflowError) as error:
         raise DataError(
-            f"{path}: expected vertices x y z and triangles, got something else: {error}"
+            f"{path}: expected vertices x y z and triangles, but could not read them: {error}"
         ) from None
     if (sides != 3).any() or (len(index) and not 0 <= index.min() <= index.max() < len(corner)):
         raise DataError(f"{path}: expected triangles that index the {len(corner)} vertices")
@@ -169,7 +169,7 @@ def relight_maps(folder: str | Path) -> dict[str, Path]:
         found = _map(folder / "envmaps", pictures.name)
         if found is None:
             raise DataError(
-                f"{pictures}: expected its environment map "
+                f"{pictures}: expected the environment map of these images, "
                 f"{folder / 'envmaps' / pictures.name}.hdr, but it does not exist"
             )
         maps[pictures.name] = found

@@ -288,7 +288,7 @@ def make_detail(scene: Scene, photos: Photos, size: int | None = None) -> Detail
     voxel, middle = scene.field.voxel_size, torch.stack(scene.field.bounds()).mean(0)
     pixel = pixel_width(photos.cameras, middle) / photos.downscale
     if not photos.readers or voxel < PIXELS_OF_VOXEL * pixel:
-        log.debug("detail: not added, because the photographs are no finer than the grid")
+        log.debug("detail: no texture added, because photographs are no finer than the grid")
         return None
     mesh = surface_of(scene, photos.cameras)
     mesh = simplify(mesh, min(FACES, len(mesh.faces)))
@@ -304,13 +304,13 @@ def make_detail(scene: Scene, photos: Photos, size: int | None = None) -> Detail
     errors = torch.tensor([baking.errors(view) for view in held])  # [H, 2]
     before, after = errors.nanmean(0).tolist() if len(held) else (math.nan, math.nan)
     if not after < before:
-        log.info("detail: not added, because it does not predict validation photographs better")
+        log.info("detail: no texture added, because it would not predict photographs better")
         return None
     for view in held:
         baking.add(view)
     gain = -10 * math.log10(after / before)
     log.info(
-        "detail: a texture of %d x %d from %d photographs, %.1f dB closer to validation",
+        "detail: a texture of %d x %d from %d photographs, which predicts others %.1f dB better",
         *(atlas.size, atlas.size, len(photos), gain),
     )
     albedo = baking.picture()
@@ -530,9 +530,9 @@ def load_detail(run: str | Path) -> Detail | None:
             came = f"{about.get('format')!r:.40}"
             raise DataError(f"{path}: expected detail in format {FORMAT}, got {came}; {remedy}")
         if about["checkpoint"] != _fingerprint(Path(run)):
-            raise DataError(f"{path}: it belongs to a checkpoint other than {CHECKPOINT}; {remedy}")
+            raise DataError(f"{path}: made for another checkpoint than {CHECKPOINT}; {remedy}")
         if about["picture"] != _digest(picture):
-            raise DataError(f"{picture}: it is not the file that {MESH} was written with; {remedy}")
+            raise DataError(f"{picture}: not the file that was written with {MESH}; {remedy}")
         albedo = torch.from_numpy(np.array(Image.open(picture).convert("RGB")))
         detail = Detail(**tensors, albedo=albedo, reach=float(about["reach"]))
         _check(detail)

@@ -349,7 +349,8 @@ def words(figures: dict[str, float], troubles: list[str]) -> str:
         "one another, not with a colour chart."
     )
     if troubles:
-        sentences.append(f"Training recovered {len(troubles)} times, last in {troubles[-1]}.")
+        last = f"The last one: {troubles[-1]}."
+        sentences.append(f"Failures from which training recovered: {len(troubles)}. {last}")
     return " ".join(sentences)
 
 
@@ -388,7 +389,7 @@ class AdviceConfig:
         least=0,
         most=1,
     )
-    share: float = setting(0.5, "minimum worth relative to the best photograph", least=0, most=1)
+    share: float = setting(0.5, "minimum worth relative to that of the best", least=0, most=1)
 
     __post_init__ = check_settings
 

@@ -97,10 +97,10 @@ class EnvmapSGConfig(LatLongConfig):
     kind: Literal["envmap-sg"] = field(default="envmap-sg", init=False, metadata=KIND)
     lobes: int = setting(128, "number of lobes", least=1)
     max_sharpness: float = setting(
-        100.0, "sharpness of a lobe; its half width is about sqrt(2 / sharpness) rad", above=0
+        100.0, "maximum sharpness of a lobe, whose half width is sqrt(2 / sharpness) rad", above=0
     )
     rows: int = setting(
-        64, "rows of the lat-long map that the lobes are rendered to", least=1, most=MOST_ROWS
+        64, "rows of the map to which the lobes are rendered", least=1, most=MOST_ROWS
     )
     directions: int = setting(64, "directions in training", least=1, most=MOST_DIRECTIONS)
     directions_eval: int = setting(256, "directions in evaluation", least=1, most=MOST_DIRECTIONS)

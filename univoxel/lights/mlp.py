@@ -34,7 +34,7 @@ class MLPLightConfig(LocalLightConfig):
     """Local light as two networks."""
 
     kind: Literal["mlp"] = field(default="mlp", init=False, metadata=KIND)
-    rank: int = setting(32, "number of basis functions that compose the light at a point", least=1)
+    rank: int = setting(32, "number of basis functions that make up the light", least=1)
     hidden: int = setting(64, "width of both networks", least=1)
     layers: int = setting(2, "hidden layers of both networks", least=0, most=MOST_LAYERS)
     frequencies: int = setting(3, "number of frequencies in the encoding of the direction", least=0)

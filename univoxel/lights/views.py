@@ -198,13 +198,13 @@ PAIRS = 500  # of cameras, whose axes are tried
 
 @dataclass(frozen=True)
 class Table:
-    """The axis about which an object was turned, while camera and light stood still."""
+    """The axis about which an object was rotated, while camera and light did not move."""
 
-    point: Vec3 = field(metadata=about("a point of the axis", unit="world units"))
-    axis: Vec3 = field(metadata=about("unit vector, pointing up"))
-    start: Vec3 = field(metadata=about("unit vector from the axis to the camera"))
+    point: Vec3 = field(metadata=about("a point on the axis", unit="world units"))
+    axis: Vec3 = field(metadata=about("unit vector along the axis, pointing up"))
+    start: Vec3 = field(metadata=about("unit vector from the axis to the first camera"))
     eyes: tuple[Vec3, ...] = setting(
-        (), "positions of its cameras; empty: all cameras are around this axis"
+        (), "positions of the cameras around this axis; empty: those of all cameras"
     )
 
     def __post_init__(self) -> None:
@@ -248,11 +248,11 @@ class Table:
 
 @dataclass(frozen=True)
 class Turntable(Table):
-    """How an object was turned before a camera and a light that stood still.
+    """How an object was rotated in front of a camera and a light that did not move.
 
-    In the world, which is the object's, the light turns about the axis as the camera does. Its own
-    frame is the world as it was when the camera stood at `start`. An object that was laid again, to
-    show its underside, has another axis for the photographs since then.
+    In the world, whose axes are fixed to the object, light and camera rotate about this axis. The
+    frame of the light coincides with the world when the camera is at `start`. If the object was
+    turned over to show its underside, the photographs after that have another axis, in `others`.
     """
 
     others: tuple[Table, ...] = setting((), "rotation axes of the object's other positions")
@@ -260,7 +260,9 @@ class Turntable(Table):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.others and not all(table.eyes for table in (self, *self.others)):
-            raise ConfigError("Turntable: each of several axes needs eyes, its cameras' positions")
+            raise ConfigError(
+                "Turntable: with several axes, each must have eyes (camera positions)"
+            )
 
     @staticmethod
     def of(cameras: Cameras) -> Turntable | None:

@@ -29,8 +29,8 @@ def section_alpha(sdf: Tensor, connected: Tensor, inv_s: float) -> Tensor:
 
         alpha_i = max(0, 1 - sigmoid(f_{i+1} / s) / sigmoid(f_i / s))
 
-    from the sdf at both ends of the section: nothing is assumed of the slope in between. Taken as a
-    difference of logarithms, it neither cancels nor divides by zero deep inside.
+    from the sdf at both ends of the section, without an assumption on the slope in between. It is
+    computed from a difference of logarithms, which neither cancels nor divides by zero deep inside.
 
     Args:
         sdf: [M] world units.
@@ -64,10 +64,10 @@ def composite(
 
     Args:
         alpha: [M] opacity of each sample, in [0, 1].
-        value: [M, C] what is composited: any number of channels.
+        value: [M, C] values to composite, with any number of channels.
         offsets: [N + 1] int64, rising from 0 to M; ray n owns samples offsets[n] .. offsets[n + 1].
         early_stop: a ray ends where its transmittance falls below this, in [0, 1]; later samples
-            weigh 0 and get no gradient. 0 never ends a ray early.
+            have weight 0 and get no gradient. 0 never ends a ray early.
 
     Returns:
         out [N, C] and weight [M]. The opacity of a ray is the sum of its weights.
@@ -125,7 +125,7 @@ SAMPLE_NUMBERS = 4  # of a held sample before its features: sdf, gradient
 
 
 class FieldAlongRays(NamedTuple):
-    """Sums over the sections of each ray, each times what it weighs."""
+    """Weighted sums over the sections of each ray."""
 
     opacity: Tensor  # [N] of the weights themselves
     t: Tensor  # [N] world units
@@ -151,18 +151,18 @@ def composite_field(
     """Sample a field along packed rays and composite it, front to back.
 
     At the samples x_i = origin + t_i direction of a ray, the field has distances f_i, gradients and
-    features as `sample_dense` (with bricks `sample_sparse`) and `encode_hash` define them. From i
-    to i + 1, where they are connected, reaches a section. With sigmoid S its opacity and weight are
+    features as `sample_dense` (with bricks `sample_sparse`) and `encode_hash` define them. If i and
+    i + 1 are connected, a section joins them. With sigmoid S, its opacity and weight are
 
         alpha_i = max(0, 1 - S(inv_s f_{i+1}) / S(inv_s f_i))
         w_i = alpha_i prod_{j < i} (1 - alpha_j)
 
-    and its value v the mean of its ends'. A sample's share is c_i = (w_{i-1} + w_i) / 2, so that
+    and its value is the mean of v at its ends. A sample's share is c_i = (w_{i-1} + w_i) / 2, so
 
         sum_i w_i (v_i + v_{i+1}) / 2 = sum_i c_i v_i
 
-    This is `composite` of `section_alpha` of what the other ops sample, without their tensors in
-    between.
+    This computes `composite` and `section_alpha` on the outputs of the sampling ops, without
+    storing tensors in between.
 
     Args:
         sdf: [X, Y, Z] world units, negative inside; with bricks [R].
@@ -175,17 +175,17 @@ def composite_field(
         inv_s: 1 / s, sharpness of the density, 1 / world units, above 0.
         bricks: of a sparse grid.
         levels: lower and upper corner and voxel sizes of a hash table, as in `encode_hash`.
-        min_share: in [0, 1), of a ray's heaviest sample. Of samples with less only the distance is
-            read: features and gradients are then the mean of the others, times the opacity.
-        sparse_grad: gradients of sdf and features come back as coalesced ``sparse_coo`` tensors of
-            touched rows. Eager only: under torch.compile ask for dense gradients.
+        min_share: in [0, 1), relative to the largest share of the ray. Of samples with less, only
+            the distance is read; features and gradients are the mean of the others, times opacity.
+        sparse_grad: return gradients of sdf and features as coalesced ``sparse_coo`` tensors of
+            touched rows. Eager only: under torch.compile, use dense gradients.
 
     Raises:
         TypeError, ValueError: an argument is no tensor, or of another size, dtype, device or range
             than above; offsets do not rise from 0 to the number of samples.
 
-    Differentiable in: sdf, features, origin, direction; which samples weigh little is taken as
-    fixed. Second order raises.
+    Differentiable in: sdf, features, origin, direction; the choice of samples by min_share is
+    treated as constant. Second order raises.
     Source: Wang et al. 2021 (NeuS), eq. 13; Max 1995 for the sums.
     """
     _check(sdf, features, origin, direction, samples, bricks, levels)

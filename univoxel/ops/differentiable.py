@@ -355,8 +355,8 @@ class _Once(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:
         raise RuntimeError(
-            f"{ctx.name}: cannot differentiate twice: this op has no second derivatives, but its "
-            'reference does: univoxel.ops.use_backend("reference")'
+            f"{ctx.name}: cannot differentiate twice, because only the reference of this op has "
+            'second derivatives: use univoxel.ops.use_backend("reference")'
         )
 
 

@@ -169,21 +169,21 @@ def sample_dense(
     cells, unlike the derivative of F, and is the trilinear interpolant of the nodes' central
     differences.
 
-    A point outside the grid is first moved to the nearest point of its border; along an axis on
-    which it moved, derivatives to the point are 0. F itself holds its border values outside, so
-    the central difference at the border is (f_1 - f_0) / (2 h): half of the one-sided one. A
-    NaN point yields NaN and contributes to no gradient.
+    A point outside the grid is first moved to the nearest point on its border; along an axis on
+    which it moved, derivatives with respect to the point are 0. Outside, F has its border values,
+    so the central difference at the border is (f_1 - f_0) / (2 h), half of the one-sided one. A NaN
+    point yields NaN and contributes to no gradient.
 
     Args:
-        sdf: [X, Y, Z] one distance a node, world units.
-        features: [X, Y, Z, C] any number of channels, 0 included.
+        sdf: [X, Y, Z] one distance per node, world units.
+        features: [X, Y, Z, C] any number of channels, including 0.
         points: [M, 3] world, fewer than 2^31.
         origin: world position of node (0, 0, 0): 3 finite numbers.
         voxel_size: h, world units, above 0.
-        sparse_grad: gradients of sdf and features come back as coalesced ``sparse_coo`` tensors
-            that hold only the rows some point touched: cheap where points meet few of many nodes,
-            and what ``RowAdam`` takes. The rows of the two differ: the gradient reaches further.
-            Eager only: under torch.compile ask for dense gradients.
+        sparse_grad: return gradients of sdf and features as coalesced ``sparse_coo`` tensors that
+            contain only the touched rows, as ``RowAdam`` takes them. This is cheap if points touch
+            few of many nodes. The gradient reaches further, so the rows of the two differ. Eager
+            only: under torch.compile, use dense gradients.
 
     Returns:
         value [M], world units; gradient [M, 3], no unit; feature [M, C].
@@ -192,8 +192,8 @@ def sample_dense(
         TypeError, ValueError: an argument is no tensor, or of another size, dtype or device than
             above; the grid has no nodes; origin or voxel_size out of range.
 
-    Differentiable in: sdf, features, points (the derivative of the outputs as defined: the
-    gradient's derivative is piecewise constant along each axis). Second order raises.
+    Differentiable in: sdf, features, points (the derivatives of the outputs as defined above: that
+    of the gradient is piecewise constant along each axis). Second order raises.
     Source: the lookup of Wu et al. 2022 (Voxurf, "grid_sampler"): gradients from neighbouring
     voxels, interpolated.
     """
@@ -265,13 +265,13 @@ def sample_sparse(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Sample a sparse grid of distances and features at points of the world.
 
-    What `sample_dense` makes of the grid [X, Y, Z] that `bricks` describes. Nodes of missing bricks
-    hold what bricks 0 and 1 hold, and get no gradient.
+    The result is that of `sample_dense` for the grid [X, Y, Z] that `bricks` describes. Nodes of
+    missing bricks have the values of bricks 0 and 1, and get no gradient.
 
     Args:
-        sdf: [R] one distance a row, world units; R = 64 n rows of the bricks.
-        features: [R, C] any number of channels, 0 included.
-        bricks: where the nodes of the grid lie.
+        sdf: [R] one distance per row, world units; R = 64 n rows of the bricks.
+        features: [R, C] any number of channels, including 0.
+        bricks: the rows of the nodes of the grid.
         points: [M, 3] world, fewer than 2^31.
         origin: world position of node (0, 0, 0): 3 finite numbers.
         voxel_size: world units, above 0.

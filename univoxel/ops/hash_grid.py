@@ -27,37 +27,37 @@ def encode_hash(
     sparse_grad: bool = False,
     felt: int | None = None,
 ) -> Tensor:
-    """Encode points of a box by L lattices whose nodes share tables of R rows.
+    """Encode points in a box by L lattices whose nodes share tables of R rows.
 
     Level l has nodes at lower + voxel_sizes[l] * (i, j, k) up to the first at or beyond upper along
-    each axis. Where they are at most R, each node has a row of its own, z fastest; otherwise its
-    row is
+    each axis. If a level has at most R nodes, each node has a row of its own, with z as the fastest
+    index; otherwise its row is
 
         (i xor 2654435761 j xor 805459861 k) mod R
 
-    and nodes may share one: which of them the row serves is up to what is learned. A level's
-    output is the trilinear interpolant of the rows of the eight nodes around the point.
+    and several nodes may share a row. A level's output is the trilinear interpolant of the rows of
+    the eight nodes around the point.
 
-    A point outside is first moved to the nearest point of the level's border; along an axis on
-    which it moved, derivatives to the point are 0. A NaN point yields NaN and contributes to no
-    gradient.
+    A point outside is first moved to the nearest point on the level's border; along an axis on
+    which it moved, derivatives with respect to the point are 0. A NaN point yields NaN and
+    contributes to no gradient.
 
     Args:
         table: [L * R, F] level after level; R a power of two, at most 2^31.
         points: [M, 3] world.
         lower, upper: corners of the box, world: 3 finite numbers each, lower at most upper.
-        voxel_sizes: L distances of nodes, world units, above 0.
-        sparse_grad: the gradient of table comes back as a coalesced ``sparse_coo`` tensor that
-            holds only the rows some point touched: what ``RowAdam`` takes. Eager only: under
-            torch.compile ask for dense gradients.
-        felt: levels, from the first on, that pass gradients on to points, at least 0; None: all.
+        voxel_sizes: L distances between nodes, world units, above 0.
+        sparse_grad: return the gradient of table as a coalesced ``sparse_coo`` tensor that contains
+            only the touched rows, as ``RowAdam`` takes it. Eager only: under torch.compile, use
+            dense gradients.
+        felt: number of levels, counted from the first, that pass gradients on to points; None: all.
 
     Returns:
         [M, L * F], level after level.
 
     Raises:
         TypeError, ValueError: an argument is no tensor, or of another size, dtype or device than
-            above; corners or voxel_sizes out of range; rows that are no power of two a level.
+            above; corners or voxel_sizes out of range; rows per level that are no power of two.
 
     Differentiable in: table, points. Second order raises.
     Source: Mueller et al. 2022, "Instant Neural Graphics Primitives", section 3.

@@ -22,7 +22,7 @@ Strategy = Literal["mis", "map", "brdf"]
 
 @dataclass(frozen=True)
 class EnvTables:
-    """An environment map as the integrator reads it; `univoxel.envmap.tables` makes them."""
+    """An environment map as the integrator reads it, created by `univoxel.envmap.tables`."""
 
     texel: Tensor  # [H, W, 4] float32: linear radiance, >= 0; sampling density, 1 / steradian
     row_cdf: Tensor  # [H + 1] float32 from 0 to 1: which row a sample falls in
@@ -101,16 +101,16 @@ def relight(
 
         L(wo) = integral over the half-sphere of f(wi, wo) L_i(wi) (n.wi) dwi
 
-    L_i is the light where nothing is in the way, else what the mesh sends back, up to `bounces`
-    times. Every vertex of a path sends a shadow ray to each sun and point light. It samples one
-    direction of the map in proportion to its light and one of the BRDF, weighed by the power
-    heuristic. The points are Sobol's sequence with an Owen scramble of its own per surface point.
-    Paths end at random where they carry little.
+    L_i is the light if nothing blocks it, and else the radiance of the mesh, for up to `bounces`
+    reflections. Every vertex of a path sends a shadow ray to each sun and point light. It samples
+    one direction of the map in proportion to its light and one of the BRDF, weighted by the power
+    heuristic. The samples are Sobol's sequence, with an Owen scramble per surface point. Paths with
+    little throughput end at random.
 
-    Points given come from volume rendering and lie on the mesh only about: their rays start at
-    position + offset * normal and pass through whatever is nearer than `offset` from there. Later
-    vertices lie on the mesh; both of its sides reflect. Directions below the horizon of the shading
-    normal carry nothing; an eye behind it sees the surface at grazing angle.
+    The given points come from volume rendering and lie only roughly on the mesh: their rays start
+    at position + offset * normal and pass through triangles that are nearer than `offset` from
+    there. Later vertices lie on the mesh, both of whose sides reflect. Directions below the horizon
+    of the shading normal contribute nothing; an eye behind it sees the surface at grazing angle.
 
     Args:
         scene: the triangles of `mesh`.
@@ -128,14 +128,14 @@ def relight(
         f0: [N, 3] float32 or a number, in [0, 1]: reflectance at normal incidence. A metal has its
             colour here and albedo 0.
         mesh_f0: [P, 3] likewise at the mesh's vertices, for bounces.
-        first: number of the first sample in the sequence, >= 0: the mean of samples 0 .. 63 is that
-            of 0 .. 31 and 32 .. 63.
-        seed: another seed, other noise; in 0 .. 2^32 - 1.
-        strategy: "map" or "brdf" draws from one of the two only: the same mean, more noise.
+        first: number of the first sample in the sequence, >= 0: the mean of samples 0 .. 63 is the
+            mean of those of 0 .. 31 and 32 .. 63.
+        seed: in 0 .. 2^32 - 1; each seed gives other noise.
+        strategy: "map" or "brdf" samples only one of the two: the same mean, with more noise.
 
     Returns:
-        [N, 3] float32 linear, finite: a point with no normal, or with anything that is not finite,
-        comes out black. The same bits for any number of threads.
+        [N, 3] float32 linear, finite: a point is black if it has no normal or any value that is not
+        finite. Bit-identical for any number of threads.
 
     Raises:
         TypeError, ValueError: an argument is no tensor, or of another size, dtype or device, or out

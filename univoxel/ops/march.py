@@ -15,15 +15,15 @@ BRICK = 4  # voxels along the side of a brick that is skipped as a whole; as kBr
 
 
 def brick_minimum(sdf: Tensor, bricks: Bricks | None = None) -> Tensor:
-    """Least sdf in each brick of 4^3 voxels (5^3 nodes; neighbours share their faces).
+    """The smallest sdf in each brick of 4^3 voxels (5^3 nodes; neighbours share their faces).
 
     Args:
         sdf: [X, Y, Z] world units; with bricks [64 n].
         bricks: of a sparse grid.
 
     Returns:
-        [ceil((X - 1) / 4), ...] at least 1 along each axis; with bricks [n]: infinity for those
-        that are missing outside or stand nowhere, minus infinity for those missing inside.
+        [ceil((X - 1) / 4), ...] at least 1 along each axis; with bricks [n]: infinity for bricks
+        that are missing outside or unused, minus infinity for those that are missing inside.
 
     Raises:
         TypeError, ValueError: an argument has another size, dtype or device than above.
@@ -86,8 +86,8 @@ def march(
 ) -> Samples:
     """Samples along rays where the NeuS density of an SDF grid is visible.
 
-    Samples stand at t = near + (k + jitter) step inside the grid's box. A section between two of
-    them is kept when it weighs more than min_weight, with
+    Samples are at t = near + (k + jitter) step inside the grid's box. A section between two of them
+    is kept if its weight is above min_weight, with
 
         alpha = max(0, 1 - sigmoid(f_end / s) / sigmoid(f_start / s))
 
@@ -97,12 +97,12 @@ def march(
 
     Args:
         sdf: [X, Y, Z] world units, negative inside; with bricks [64 n].
-        brick_min: `brick_minimum(sdf, bricks)`; may lag a few optimisation steps behind.
+        brick_min: `brick_minimum(sdf, bricks)`; may be a few optimisation steps old.
         origin, direction: [N, 3] rays in the world, direction unit.
-        jitter: [N] in [0, 1): where in its first step a ray starts.
+        jitter: [N] in [0, 1): the point within its first step at which a ray starts.
         grid_origin: world position of node (0, 0, 0).
         voxel_size: world units.
-        step: distance of samples, world units, > 0.
+        step: distance between samples, world units, > 0.
         inv_s: 1 / s, sharpness of the density, 1 / world units, > 0.
         min_weight: in [0, 1].
         early_stop: a ray ends where its transmittance falls below this, in [0, 1].

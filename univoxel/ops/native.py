@@ -41,7 +41,7 @@ _told: set[str] = set()  # reasons that were told, once each
 
 @dataclass(frozen=True)
 class NativeStatus:
-    """What is known of the compiled extension."""
+    """The status of the compiled extension."""
 
     loaded: bool
     variant: str | None  # instruction set of the build that is loaded: default, avx2 or avx512
@@ -173,14 +173,14 @@ def require_embree(what: str) -> ModuleType:
     """The extension with rays, or an error that says what is missing and how to get it.
 
     Args:
-        what: needs it; begins the message.
+        what: needs Embree; the subject of the message.
     """
     found = require()
     if not found.embree_version():
         raise MissingNative(
-            f"{what}: univoxel was built without Embree, which it needs for ray tracing; install "
-            "a wheel that includes it (pip install --only-binary univoxel univoxel), or Embree "
-            "3 or 4 (Debian: apt-get install libembree-dev) and rebuild (pip install .)"
+            f"{what} needs Embree for ray tracing, but univoxel was built without it: install "
+            "Embree 3 or 4 (Debian: apt-get install libembree-dev) and rebuild univoxel (pip "
+            "install . in its source folder), or install a wheel that includes Embree"
         )
     return found
 

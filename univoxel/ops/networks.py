@@ -20,8 +20,8 @@ def mlp(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tenso
 
     Args:
         x: [N, A] any number of rows.
-        weights: one [out, in] a layer, as in torch.nn.Linear; every size at least 1.
-        biases: one [out] a layer.
+        weights: one [out, in] per layer, as in torch.nn.Linear; every size at least 1.
+        biases: one [out] per layer.
 
     Returns:
         [N, Z], Z the last layer's `out`.
@@ -35,7 +35,7 @@ def mlp(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tenso
     weights, biases = list(weights), list(biases)
     if not weights or len(weights) != len(biases):
         raise ValueError(
-            f"mlp: expected one of weights and one of biases for each of one or more layers, got "
+            f"mlp: expected as many weights as biases, and at least one of each, got "
             f"{len(weights)} weights and {len(biases)} biases"
         )
     layers: dict[str, tuple[Tensor, str]] = {}

@@ -29,8 +29,8 @@ def patch_correlation(
 
     The pixels of a patch look along d = direction_0 + c direction_1 + r direction_2, with c and r
     the columns and rows from its middle. They meet the plane through position with the normal at
-    the depth t = normal.(position - origin) / normal.d; origin + t d is looked up in another view,
-    bilinearly. Of brightness a there, b here, both without their means,
+    the depth t = normal.(position - origin) / normal.d. The brightness at origin + t d is read from
+    another view, bilinearly. With the brightness a there and b here, both minus their means,
 
         correlation = mean(a b) / sqrt((mean(a^2) + noise^2) (mean(b^2) + noise^2))
 
@@ -38,12 +38,12 @@ def patch_correlation(
         brightness: [V, H, W] of all views, of any scale; below 0 where there is nothing to compare.
             H and W at least 2. Of the dtype of the others, or float16.
         projection: [V, 3, 4] world to (x z, y z, z), with x and y in pixels: 0.5 is the middle of
-            the first, as in `univoxel.camera.projection_matrices`.
-        origin: [N, 3] eye of the view that a patch is a square of pixels in.
+            the first pixel, as in `univoxel.camera.projection_matrices`.
+        origin: [N, 3] eye of the view in which a patch is a square of pixels.
         direction: [N, 3, 3] as above.
-        own: [N, M] brightness of the pixels there, row by row; M the square of an odd number.
-        views: [N, K] numbers of the others.
-        position: [N, 3] a point of a patch's plane, world units.
+        own: [N, M] brightness of these pixels, row by row; M the square of an odd number.
+        views: [N, K] indices of the other views.
+        position: [N, 3] a point on a patch's plane, world units.
         normal: [N, 3] of the plane, of any length.
         noise: brightness below which variation counts little, above 0.
 
@@ -71,7 +71,7 @@ def patch_correlation(
     side = math.isqrt(sizes["M"])
     if side * side != sizes["M"] or side % 2 == 0:
         raise ValueError(
-            f"patch_correlation: own must have the square of an odd number of pixels, "
+            f"patch_correlation: own must have n x n pixels per patch, with an odd n, "
             f"got {sizes['M']}"
         )
     if min(sizes["H"], sizes["W"]) < 2:
@@ -193,22 +193,23 @@ def match_cost(
 ) -> Tensor:
     """Matching cost between photographs for candidate points along the rays of pixels.
 
-    Points start + k step are looked up in other views (bilinear); the mean absolute difference of
-    the colours, `most` at the highest and where nothing is to be seen there, is averaged over a
-    window of pixels of one k, and over the `best` views that agree most: others may not see it.
+    The colours of points start + k step are read from other views (bilinear). Their mean absolute
+    difference, which is limited to `most` and equals `most` where a view shows no object, is
+    averaged over a window of pixels of one k, and over the `best` views that agree most, because
+    the point may be hidden in others.
 
     Args:
         pictures: [V, H, W, 4] uint8 colours times coverage, and coverage.
         matrix: [V, 3, 4] float32 world to (x z, y z, z): pixels from the top left corner, depth.
         origin, direction: [N, 3] float32 rays of the pixels.
-        start: [N] float32 where they start.
+        start: [N] float32 distance at which the points start.
         color: [N, 3] float32 straight colours of the pixels, in [0, 1].
-        rows: [H, W] int64 which ray is a pixel's; -1: none.
+        rows: [H, W] int64 index of the ray of each pixel; -1: none.
         others: [M] int64 views to compare with.
-        step: between points, world units where directions are unit.
-        steps: K, points of a ray.
-        radius: pixels around one in its window; 0: itself alone.
-        best: views, 1 to M.
+        step: distance between points, world units if directions are unit.
+        steps: K, number of points on a ray.
+        radius: of the window, pixels; 0: only the pixel itself.
+        best: number of views, 1 to M.
 
     Returns:
         [N, K] float32 in [0, most].
@@ -293,20 +294,20 @@ def match_cost_reference(
 
 @torch.no_grad()
 def semi_global(cost: Tensor, rows: Tensor, small: float, large: float) -> Tensor:
-    """Semi-global matching: sums of costs over the four straight paths to each pixel.
+    """Semi-global matching: sums of costs along the four straight paths to each pixel.
 
         L(p, k) = C(p, k) + min(L(q, k), L(q, k -+ 1) + small, m + large) - m,   m = min_i L(q, i)
 
-    with q the pixel before p on the path; a pixel without a ray ends it. The least sum says which k
-    a pixel should take.
+    with q the pixel before p on the path; a pixel without a ray ends the path. Each pixel should
+    take the k with the smallest sum.
     Source: Hirschmueller 2005, "Accurate and efficient stereo processing by semi-global matching",
     equation 13.
 
     Args:
         cost: [N, K] float32.
-        rows: [H, W] int64 which row of cost is a pixel's; -1: none.
-        small: for a step of 1 between neighbours.
-        large: for a greater one; at least small.
+        rows: [H, W] int64 index of the row of cost of each pixel; -1: none.
+        small: penalty for a step of 1 between neighbours.
+        large: penalty for a larger step; at least small.
 
     Returns:
         [N, K] float32.
@@ -354,4 +355,4 @@ def _check_rows(op: str, rows: Tensor, count: int) -> None:
     """Each of the N rays is the ray of one pixel."""
     named = rows[rows >= 0].sort().values
     if not torch.equal(named, torch.arange(count, device=rows.device)):
-        raise ValueError(f"{op}: rows must contain each of the {count} rays once, else -1")
+        raise ValueError(f"{op}: rows must contain each of the {count} rays once, and else -1")

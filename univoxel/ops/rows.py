@@ -30,9 +30,9 @@ def adam_rows_(
         param = param - lr / (1 - beta1^step) m / (sqrt(v / (1 - beta2^step)) + eps)
 
     The moments of a row decay only when the row is touched, while the bias correction counts the
-    steps of the whole table, as in ``torch.optim.SparseAdam``. eps is beside the corrected root
-    as in ``torch.optim.Adam``, so that an eps which matters means the same for rows as for dense
-    tensors; SparseAdam adds it to the root before the correction.
+    steps of the whole table, as in ``torch.optim.SparseAdam``. eps is added to the corrected root,
+    as in ``torch.optim.Adam``, so that it has the same effect on rows as on dense tensors;
+    SparseAdam adds it to the root before the correction.
 
     Args:
         param: [R, C] contiguous, changed in place.
@@ -44,7 +44,7 @@ def adam_rows_(
         beta1: in [0, 1).
         beta2: in [0, 1).
         eps: at least 0, in the unit of the gradient.
-        step: from 1: how many steps the table has taken, this one included.
+        step: number of steps that the table has taken, including this one; at least 1.
 
     Raises:
         TypeError, ValueError: an argument is no tensor, or of another size, dtype or device than
@@ -135,13 +135,13 @@ def sum_rows(
     contrast, sorts to sum sparse tensors, on one thread.
 
     Args:
-        rows: lists [K] int64 of numbers of rows, strictly ascending; K may differ. At least one.
+        rows: at least one list [K] int64 of indices of rows, strictly ascending; K may differ.
         values: for each list [K, C].
-        shape: of the table, D sizes; rows count its last dimension fastest. [R] for a plain one.
+        shape: D sizes of the table; the last dimension is fastest in rows. [R] for a plain table.
 
     Returns:
         Indices [D, U] into the table of the rows that are in any list, ascending, and their sums
-        [U, C]: what ``torch.sparse_coo_tensor`` takes.
+        [U, C], as ``torch.sparse_coo_tensor`` takes them.
 
     Raises:
         TypeError, ValueError: an argument is no tensor, or of another size, dtype or device than
@@ -149,7 +149,7 @@ def sum_rows(
     """
     if not rows or len(rows) != len(values):
         raise ValueError(
-            f"sum_rows: expected equally many rows and values, at least one of each, got "
+            f"sum_rows: expected as many rows as values, and at least one of each, got "
             f"{len(rows)} and {len(values)}"
         )
     arguments: dict = {}

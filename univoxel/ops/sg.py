@@ -31,11 +31,11 @@ def decode_lobes(
         parameters: [M, 7] any numbers: three for the axis, one for the sharpness, three for the
             amplitude; any number of lobes.
         min_sharpness: at least 0.
-        max_sharpness: above 0; what is added to it at most.
+        max_sharpness: above 0; the most that is added to min_sharpness.
 
     Returns:
-        axis [M, 3] unit, sharpness [M] and amplitude [M, 3] >= 0. The axis of a vector shorter than
-        1e-6 is shorter than 1: so its gradient stays finite.
+        axis [M, 3] unit, sharpness [M] and amplitude [M, 3] >= 0. If a vector is shorter than 1e-6,
+        its axis is shorter than 1, so that the gradient stays finite.
 
     Raises:
         TypeError, ValueError: parameters is no tensor, or of another size or dtype than above; a
@@ -106,8 +106,8 @@ def shade_sg(
         rgb = (2 pi / D) sum_d L(w_d) f(w_d, wo) max(n.w_d, 0)
         L(w) = sum_k amplitude_k exp(sharpness_k (w.axis_k - 1))
 
-    with f the BRDF of docs/reference/conventions.md and w_d the directions, turned by the rotation
-    about +Z and put into the frame of the normal (sphere.frame).
+    with f the BRDF of docs/reference/conventions.md and w_d the directions, rotated about +Z by
+    `rotation` and transformed into the frame of the normal (sphere.frame).
 
     Args:
         axis: [N, K, 3] unit, world; any number of lobes.
@@ -118,7 +118,7 @@ def shade_sg(
         roughness: [N] perceptual, in [0, 1].
         directions: [D, 3] unit, around +Z, of equal solid angle, such as
             sphere.fibonacci_hemisphere; any number above 0.
-        rotation: [N] radians; random turns trade the pattern of a fixed set for noise.
+        rotation: [N] radians; random rotations replace the pattern of a fixed set by noise.
         f0: reflectance at normal incidence, in [0, 1]: a number, or [N, 3] per channel.
 
     Returns:
@@ -128,8 +128,8 @@ def shade_sg(
         TypeError, ValueError: an argument is not a tensor, or has another size or dtype than above;
             no directions; f0 a number outside [0, 1].
 
-    Differentiable in: axis, sharpness, amplitude, normal (the directions turn with it), wo, albedo,
-    roughness, f0 where it is a tensor. Second order raises.
+    Differentiable in: axis, sharpness, amplitude, normal (the directions rotate with it), wo,
+    albedo, roughness, f0 if it is a tensor. Second order raises.
     """
     sizes = check(
         "shade_sg",

@@ -54,8 +54,8 @@ def shade_radiance(
     with f the BRDF of docs/reference/conventions.md.
 
     Args:
-        radiance: [N, D, 3] linear, arriving from each direction; what comes from below a point's
-            horizon counts for nothing.
+        radiance: [N, D, 3] linear, arriving from each direction; light from below the horizon of a
+            point does not count.
         normal, wo: [N, 3] unit, world; wo points to the eye.
         albedo: [N, 3] linear, in [0, 1].
         roughness: [N] perceptual, in [0, 1].
@@ -72,8 +72,8 @@ def shade_radiance(
             no directions; solid_angle not above 0; f0 a number outside [0, 1].
         NotImplementedError: wo requires grad.
 
-    Differentiable in: radiance, normal (as any vector: a change of its length counts too), albedo,
-    roughness, f0 where it is a tensor. Second order raises.
+    Differentiable in: radiance, normal (as an arbitrary vector, whose length also matters), albedo,
+    roughness, f0 if it is a tensor. Second order raises.
     """
     check(
         "shade_radiance",
@@ -116,10 +116,10 @@ def shade_map(
 
     Args:
         map: [D, 3] linear radiance of the distant light.
-        visibility: [P, D] the share of each direction that P points see: of map's dtype in [0, 1],
-            or uint8 in 255ths.
-        indirect: [P, D, 3] linear radiance from the occluded share, times that share: of map's
-            dtype, or float16.
+        visibility: [P, D] the share of each direction that is open at each of P points: in [0, 1]
+            with the dtype of map, or uint8 in 255ths.
+        indirect: [P, D, 3] linear radiance from the occluded share, times that share, with the
+            dtype of map or float16.
         index: [N] int64 in [0, P), the point of each sample.
         normal, wo, albedo, roughness, directions, solid_angle, f0: as in shade_radiance.
 
@@ -170,7 +170,7 @@ def _check_rest(op: str, directions: Tensor, solid_angle: float, **constants: Te
         raise ValueError(f"{op}: solid_angle must be above 0 and finite, got {solid_angle}")
     for name, tensor in constants.items():
         if tensor.requires_grad and torch.is_grad_enabled():
-            raise NotImplementedError(f"{op}: no gradient to {name}; detach it")
+            raise NotImplementedError(f"{op}: has no gradient with respect to {name}; detach it")
 
 
 def shade_radiance_reference(
@@ -262,8 +262,8 @@ def specular_response(
 
         response_nd = solid_angle f_specular(w_d, wo_n) max(n.w_d, 0)
 
-    with f of docs/reference/conventions.md. These are rows of an equation for a light that is not
-    known yet. Linear in F0.
+    with f of docs/reference/conventions.md. The results are rows of an equation for a light that is
+    not known yet, and they are linear in F0.
 
     Args:
         normal, wo: [N, 3] unit, world; wo points to the eye.

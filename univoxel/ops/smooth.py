@@ -21,16 +21,17 @@ def smooth_rows_(
         order 1:  f += amount L f      diffusion towards the mean of the neighbours
         order 2:  f -= amount L L f    thin plate: linear functions, such as a flat SDF, stay
 
-    with L f = mean of the six neighbours - f; at the border the nearest node repeats. Meant as a
-    regulariser beside the optimiser, as decoupled weight decay is (Loshchilov and Hutter 2019).
+    with L f = mean of the six neighbours - f; at the border, the nearest node is repeated. It is
+    meant as a regulariser beside the optimiser, like decoupled weight decay (Loshchilov and Hutter
+    2019).
 
     Args:
         grid: [X, Y, Z, C] contiguous; with bricks [64 n, C].
-        rows: [K] int64 flat node indices ((x Y) + y) Z + z, without repeats; with bricks rows of
-            bricks that stand somewhere, fastest in ascending order.
+        rows: [K] int64 flat node indices ((x Y) + y) Z + z, without repeats; with bricks, rows of
+            bricks in use. Ascending order is fastest.
         amount: in [0, 1]; order 2 is stable up to 0.5.
         order: 1 or 2.
-        bricks: of a sparse grid. Neighbours that are missing are what bricks 0 and 1 hold.
+        bricks: of a sparse grid. Missing neighbours have the values of bricks 0 and 1.
 
     Returns:
         grid.
@@ -88,16 +89,16 @@ def diffuse_rows_(
 ) -> Tensor:
     """Diffuse values in place among the chosen nodes of a grid that is 0 elsewhere.
 
-        f += amount L f, passes times; L as in `smooth_rows_`, f = 0 where no row is
+        f += amount L f, passes times; L as in `smooth_rows_`, f = 0 at nodes that are not in rows
 
-    Of a gradient, before an optimiser's step: steps of neighbours then agree, and a surface moves
-    in large pieces (a Sobolev gradient, as in Nicolet et al. 2021, Large Steps in Inverse Rendering
-    of Geometry).
+    Apply it to a gradient before the optimiser's step, so that neighbours move alike and a surface
+    moves in large pieces (a Sobolev gradient, as in Nicolet et al. 2021, Large Steps in Inverse
+    Rendering of Geometry).
 
     Args:
         values: [K] contiguous.
-        rows: [K] int64 ascending flat node indices ((x Y) + y) Z + z; with bricks rows of bricks
-            that stand somewhere.
+        rows: [K] int64 ascending flat node indices ((x Y) + y) Z + z; with bricks, rows of bricks
+            in use.
         size: [X, Y, Z] of the grid.
         amount: in [0, 1].
         passes: at least 0.

@@ -16,8 +16,8 @@ from univoxel.ops.differentiable import check
 class Hit:
     """The nearest triangle along each of N rays."""
 
-    t: Tensor  # [N] float32, along the ray in units of its direction; infinity: nothing met
-    face: Tensor  # [N] int64; -1: nothing met
+    t: Tensor  # [N] float32, along the ray in units of its direction; infinity: nothing is hit
+    face: Tensor  # [N] int64; -1: nothing is hit
     barycentric: Tensor  # [N, 2] float32 (u, v): the point is (1 - u - v) p0 + u p1 + v p2
 
 
@@ -26,11 +26,11 @@ class VisibilityScene:
 
     Args:
         vertices: [P, 3] float32, world; on the CPU.
-        faces: [F, 3] int32 or int64 rows of vertex indices. None is allowed: nothing is hit.
+        faces: [F, 3] int32 or int64 rows of vertex indices. If F is 0, nothing is hit.
 
     Raises:
         TypeError, ValueError: an argument is no tensor, or of another size, dtype or device than
-            above; a vertex is not finite; a face names a vertex that is not there.
+            above; a vertex is not finite; a face has the index of a vertex that does not exist.
         RuntimeError: the compiled extension is missing or was built without Embree; within
             ``use_backend("reference")`` neither is needed.
 
@@ -73,9 +73,9 @@ class VisibilityScene:
 
         Args:
             origin: [N, 3] float32, world.
-            direction: [N, 3] float32; t counts in its length. A ray that is not finite meets
+            direction: [N, 3] float32, whose length is the unit of t. A ray that is not finite hits
                 nothing.
-            t_min, t_max: what lies nearer or farther is ignored; 0 <= t_min <= t_max.
+            t_min, t_max: nearer and farther triangles are ignored; 0 <= t_min <= t_max.
 
         Returns:
             [N] bool.
@@ -125,7 +125,7 @@ class VisibilityScene:
         return hit
 
     def native(self) -> Any:
-        """The native scene, or None if the reference is asked for; for ops that trace rays."""
+        """The native scene, for ops that trace rays; None within use_backend("reference")."""
         if native.reference_asked():
             return None
         if self._native is None:

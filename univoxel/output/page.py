@@ -241,29 +241,31 @@ POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "img-src data: blob:; connect-src data: blob:"
 )
-LICENCE = "Drawn with three.js, \u00a9 three.js authors, MIT licence, in the page's source."
+LICENCE = (
+    "Drawn with three.js (\u00a9 three.js authors; its MIT licence is in the source of the page)."
+)
 SOURCES = {name: f"Map {name!r}: Greg Zaal, Poly Haven, CC0." for name in PHOTOGRAPHED}
 KEYS = """1 to 5: layers
 Left, Right: rotate the light; Space: rotate it continuously
-L: dragging rotates the light, as it does with Shift
+L: let dragging rotate the light instead of the view; so does holding Shift
 B: backdrop, S: save the image, 0: first view"""
 
 
 @dataclass(frozen=True)
 class PageOptions:
-    """What a page holds.
+    """What a page contains.
 
     Raises:
-        UserError: a name of a map is there twice.
+        UserError: two maps have the same name.
     """
 
-    title: str | None = None  # None: the run folder's name
-    envmaps: Sequence[str | Path] = ()  # maps to offer before the usual ones
-    notes: str = ""  # what to tell first
-    measures: Mapping[str, str] = field(default_factory=dict)  # what to tell, by what it is
-    faces: int = FACES  # most triangles
-    texture_size: int = TEXTURE_SIZE  # texels along a side, a power of 2
-    albedo_near: AlbedoNear | None = None  # what gives the albedo, in place of the field
+    title: str | None = None  # None: the name of the run's folder
+    envmaps: Sequence[str | Path] = ()  # maps to offer before the built-in ones
+    notes: str = ""  # text at the beginning of the page
+    measures: Mapping[str, str] = field(default_factory=dict)  # metrics to show, by their names
+    faces: int = FACES  # maximum number of triangles
+    texture_size: int = TEXTURE_SIZE  # width of the square textures in texels, a power of 2
+    albedo_near: AlbedoNear | None = None  # source of the albedo; None: the field
 
     def __post_init__(self) -> None:
         names = [Path(path).stem for path in self.envmaps]

@@ -77,7 +77,7 @@ def curves(run: Path) -> list[Curve]:
             if line["held_out_psnr"] is not None:
                 qualities[-1].append((seconds, float(line["held_out_psnr"])))
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
-        log.info("no curves: %s could not be read: %s", run / LOG, error)
+        log.info("no curves are shown, because %s could not be read: %s", run / LOG, error)
         return []
     found = (
         Curve("loss: the sum of all terms", losses, logarithmic=True),
@@ -91,7 +91,7 @@ def configuration(run: Path) -> TrainConfig | None:
     try:
         return load_config(run / "config.json")
     except (UserError, OSError) as error:
-        log.info("no table of stages: %s", error)
+        log.info("no table of stages is shown: %s", error)
         return None
 
 
@@ -138,7 +138,8 @@ def remarks(cfg: TrainConfig, state: dict[str, Any]) -> list[str]:
         told.append(cut[0].upper() + cut[1:] + ".")
     troubles: Sequence[str] = state.get("troubles", ())
     if troubles:
-        told.append(f"Training recovered {len(troubles)} times, last in {troubles[-1]}.")
+        last = f"The last one: {troubles[-1]}."
+        told.append(f"Failures from which training recovered: {len(troubles)}. {last}")
     chosen = [entry.get("said", "") for entry in state.get("chosen", ())]
     return told + [f"Model size: {said}." for said in chosen if said]
 
@@ -167,12 +168,12 @@ class ReportOptions:
         UserError: a number is out of range.
     """
 
-    title: str | None = None  # None: the run folder's name
-    data: str | Path | None = None  # photographs; None: those that the run names
-    views: int = 4  # photographs beside their render, the worst first; >= 0
-    size: int = 256  # pixels along the longer side of pictures, >= 16
-    advice: AdviceConfig = ADVICE  # how directions are chosen
-    albedo_near: AlbedoNear | None = None  # what gives the albedo, in place of the field
+    title: str | None = None  # None: the name of the run's folder
+    data: str | Path | None = None  # folder of the photographs; None: the one that the run names
+    views: int = 4  # number of photographs to show beside their render, the worst first; >= 0
+    size: int = 256  # longer side of the images in pixels, >= 16
+    advice: AdviceConfig = ADVICE  # how directions for more photographs are chosen
+    albedo_near: AlbedoNear | None = None  # source of the albedo; None: the field
 
     def __post_init__(self) -> None:
         for name, least in (("views", 0), ("size", 16)):
@@ -290,7 +291,7 @@ def next_section(advice: Advice) -> str:
     if advice.hidden >= 0.01:
         told.append(
             f"{advice.hidden:.0%} of the surface is not seen in any photograph, nor from any of "
-            "these directions: turn the object over for a second run, or leave it as it is."
+            "these directions: turn the object over and photograph it again, or accept the gap."
         )
     told.append(
         f"The front is where {advice.front_name} was taken. Left and right are as seen from "
@@ -359,8 +360,8 @@ def light_section(scene: Scene, mesh: Mesh) -> str:
     names = ("map", "diffuse sphere", "chrome sphere")
     tiles = zip(names, report_pictures.pictures_of(found), strict=True)
     legend = (
-        "Spheres are seen from +X, with +Z up. Photographs cannot separate the scale of light "
-        "and albedo, per channel."
+        "Spheres are seen from +X, with +Z up. In each channel, photographs cannot separate the "
+        "scale of the light from that of the albedo."
     )
     return paragraph(found.about) + gallery(tiles, legend, "light")
 
@@ -374,7 +375,7 @@ def training_section(run: Path, state: dict[str, Any]) -> str:
         parts.append(f'<div class="charts">{"".join(drawn)}</div>')
         parts.append(paragraph(CHARTS))
     else:
-        parts.append(paragraph("This training has no log to draw."))
+        parts.append(paragraph("There are no curves, because this run has no log."))
     cfg = configuration(run)
     if cfg is None:
         return "\n".join(

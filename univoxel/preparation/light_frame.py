@@ -137,9 +137,9 @@ def say_strays(photos: Photos) -> None:
     found = strays.nonzero()[:, 0].tolist()
     names = ", ".join(photos.names[view] for view in found[:NAMED])
     log.warning(
-        "%d of %d camera poses are up to %.1f degrees off the circle around the turntable (the "
-        "others: %.1f in the median). Surfaces that only %s%s show will not fit; to find all "
-        "poses again, run `univoxel poses` with the photographs' masks; see cameras",
+        "%d of %d camera poses are up to %.1f degrees off the circle around the turntable (median "
+        "of the others: %.1f). Surfaces that only %s%s show will not fit. To find all poses "
+        "again, run `univoxel poses` with the photographs' masks; see also cameras",
         len(found),
         len(photos),
         math.degrees(float(circle.off[strays].max())),
@@ -229,8 +229,8 @@ def light_frame_of(
     if frame == "turntable":
         if turntable is None:
             raise DataError(
-                f"{photos.folder}: light_frame turntable: the cameras are not around one upright "
-                "axis, so the axis of the turntable is unknown",
+                f"{photos.folder}: light_frame=turntable needs cameras around one upright axis, "
+                "but these are not, so the axis of the turntable is unknown",
                 "light_frame",
             )
         return LightFrame(turntable)
@@ -242,7 +242,7 @@ def light_frame_of(
     if (flashed.shade > SHADE or flashed.glint > GLINT) and flashed.ahead > CERTAIN:
         log.info(
             "light: a flash at the camera, which explains %.0f %% more of the colour changes "
-            "between photographs than a fixed light; see light_frame",
+            "between photographs than a fixed light; light_frame overrides this",
             100 * flashed.saved,
             extra={"arguments": ("light_frame",)},
         )
@@ -259,8 +259,8 @@ def light_frame_of(
     if not still_around and found.saved < LEAST:
         return LightFrame()
     log.info(
-        "light: it rotates with the camera, as on a turntable%s; this explains %.0f %% of the "
-        "colour changes between photographs, a fixed light explains %.0f %%; see light_frame",
+        "light: it rotates with the camera, as on a turntable%s, which explains %.0f %% of the "
+        "colour changes between photographs (a fixed light: %.0f %%); light_frame overrides this",
         f", with {len(turntable.tables)} positions of the object" if turntable.others else "",
         100 * found.by_turning_light,
         100 * max(found.by_still_light, 0.0),  # none, where the other half contradicts it

@@ -223,7 +223,7 @@ def nothing_inside(box: Tensor, what: str, cameras: Cameras) -> UserError:
     return UserError(
         f"box: expected a box around the object, got {words_of(box.flatten().tolist())}, in "
         f"which {what}; the cameras look at {words_of(looked_at(cameras).tolist())}, and half of "
-        f"them show at least {reach(cameras):.4g} around that point",
+        f"them show the cube that extends {reach(cameras):.4g} from there in each direction",
         "box",
     )
 

@@ -338,8 +338,8 @@ def _say(seen: Agreement | None, off: float, believed: bool, refined: bool) -> N
     if seen is None and believed:
         contradicting += ", and pose refinement does not help"
     if seen is not None:
-        lie = f"epipolar error {seen.median:.2f} pixels"
-        contradicting = f"{contradicting}, {lie}"
+        lie = f"the epipolar error is {seen.median:.2f} pixels"
+        contradicting = f"{contradicting}, and {lie}"
     if believed and not refined:
         then = "the masks are assumed to be rough; better masks improve the result"
     else:

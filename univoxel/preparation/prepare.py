@@ -168,7 +168,7 @@ def say_clipped(photos: Photos) -> None:
     share = clipped_share(photos)
     if share > MUCH_CLIPPED:
         log.info(
-            "%.0f %% of the object is overexposed, so detail is lost there. Expose less next time",
+            "%.0f %% of the object is overexposed, so detail is lost there. Next time, expose less",
             100 * share,
         )
 
@@ -202,7 +202,7 @@ def varying_and_gains(
         varying = "exposure"
         log.info(
             "exposures differ by %.2f stops between photographs, so a gain is learned for each; "
-            "see varying",
+            "varying=none switches this off",
             stops,
             extra={"arguments": ("varying",)},
         )

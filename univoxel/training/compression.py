@@ -308,8 +308,8 @@ def check_budget(scene: Scene, budget_mb: float) -> None:
     least = _bytes_apart_from_grid(scene) + FEWEST_VOXELS // 2 * _node_bytes(scene)
     if 1e6 * budget_mb < least:
         raise UserError(
-            f"budget_mb: {budget_mb:g} is too low: networks, environment map and the coarsest "
-            f"grid need {least / 1e6:.2g} MB",
+            f"budget_mb must be at least {least / 1e6:.2g} to hold networks, environment map and "
+            f"the coarsest grid, got {budget_mb:g}",
             "budget_mb",
         )
 

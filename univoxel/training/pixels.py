@@ -160,7 +160,7 @@ def check_memory(photos: Photos, cfg: TrainConfig, there: Memory | None = None) 
     if further + have > there.total:
         raise UserError(f"{what}: pass {change}", "downscale", "preset")
     log.warning(
-        "%s: if the system kills the training, pass %s or close other programs",
+        "%s: if the system kills the training process, pass %s or close other programs",
         *(what, change),
         extra={"arguments": ("downscale", "preset")},
     )

@@ -77,16 +77,16 @@ CHECKPOINT_SECONDS = 20.0  # of work that a kill costs, about
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """How far a training is."""
+    """The progress of a training run."""
 
-    stage: int  # from 1
-    stages: int
-    name: str  # what the stage is for, such as "shape"
-    share: float  # of the whole run, in [0, 1]
-    seconds: float  # of training so far
-    remaining: float  # seconds, about
-    losses: dict[str, float]  # weighted, by name
-    held_out_psnr: float | None  # dB, of pixels that are only looked at; None: not measured now
+    stage: int  # number of the stage, starting at 1
+    stages: int  # number of stages
+    name: str  # name of the stage, such as "shape"
+    share: float  # progress of the whole run, in [0, 1]
+    seconds: float  # training time so far
+    remaining: float  # estimated remaining seconds
+    losses: dict[str, float]  # weighted losses, by name
+    held_out_psnr: float | None  # PSNR of validation pixels, dB; None: not measured in this call
     rays_per_second: float
 
 
@@ -172,7 +172,9 @@ class Progress:
         self._show(f"preparation: {what}", "")
         if not needed and self.clock.hurried and not self._goes_on:
             self.skipped.append(what)
-            log.info(f"minutes leaves no time for {what}", extra={"arguments": ("minutes",)})
+            log.info(
+                f"minutes leaves no time for a step: {what}", extra={"arguments": ("minutes",)}
+            )
         return what not in self.skipped
 
     def prepared(self) -> None:

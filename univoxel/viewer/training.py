@@ -68,7 +68,7 @@ def _guard(server: Any, host: str) -> None:
     """Answer pages of this server only, and tell nobody outside of it."""
 
     def refused(*args: Any, **options: Any) -> None:
-        log.warning("refused: a page asked to share the viewer with the network")
+        log.warning("refused a page that asked to share the viewer with the network")
 
     server.request_share_url = refused  # would open a tunnel to a host outside
     inner = server._websock_server
@@ -78,7 +78,7 @@ def _guard(server: Any, host: str) -> None:
         websocket = inner._live_connections[connection.client_id]
         headers = websocket.request.headers
         if not same_site(headers.get("Origin"), headers.get("Host"), host):
-            log.warning("refused: a page of %s asked for the viewer", headers.get("Origin"))
+            log.warning("refused a page of %s that asked for the viewer", headers.get("Origin"))
             await websocket.close(1008, "another site")
 
 
