@@ -5,8 +5,8 @@
 DATA is a scene in NeRF layout with test views. A sector of its photographs is kept back, and as
 many others as are added, spread over the rest. It is trained without them, and with as many more:
 of those kept back the nearest to the advised directions, or the others. Prints, for each, the mean
-doubt of the surface and the measures of the test views. What is done already in WORK is not done
-again.
+expected error of the albedo and the measures of the test views. What is done already in WORK is not
+done again.
 """
 
 from __future__ import annotations
@@ -104,8 +104,8 @@ def main() -> None:
         run = trained(data, asked.work / name, asked.preset, asked.seed)
         surveyed, advice = looked_through(run, asked.more)
         measured = evaluate(run, samples=16)
-        doubts = {"doubt": surveyed.albedo.mean(), "seen": surveyed.seen_with(surveyed.straight)}
-        figures = {key: float(value.mean()) for key, value in doubts.items()}
+        seen = surveyed.seen_with(surveyed.straight)
+        figures = {"error": float(surveyed.errors[:, 0].mean()), "seen": float(seen.mean())}
         return figures | {key: measured[key] for key in SHOWN}, advice
 
     print(f"{int(sector.sum())} photographs in the sector, {len(before)} before")

@@ -61,7 +61,7 @@ FIGURES = [
     ),
     Figure(
         "chart",
-        90,
+        45,
         (f"univoxel lab chart {ALL} --out {{work}}/chart --only draft fast full --seeds 3",),
         "chart/chart",
     ),

@@ -74,7 +74,7 @@ def chart(
         only: names of settings; empty: all.
         changes: FIELD=VALUE of the configuration, for all training runs.
         samples: light samples per pixel of relit images.
-        seeds: training runs per scene and setting, >= 1; files and figure show their medians.
+        seeds: training runs with `preset` on each scene, >= 1; files and figure show their medians.
         jobs, scheduler: number of runs at a time, or a Dask scheduler; see runner.run_pairs.
 
     Returns:
@@ -93,10 +93,11 @@ def chart(
         raise UserError(f"only must be among {', '.join(chosen)}, got {', '.join(unknown)}", "only")
     if seeds < 1:
         raise UserError(f"seeds must be at least 1, got {seeds}", "seeds")
-    trained = [seeded(chosen[name], seed) for name in wanted for seed in range(seeds)]
-    runs = runner.run(scenes, trained, out, samples, at_once=jobs, scheduler=scheduler)
-    groups = [runs[k : k + seeds] for k in range(0, len(runs), seeds)]
-    outcomes = [median_of(group) for group in groups]
+    groups = [[seeded(chosen[x], k) for k in range(seeds if x == preset else 1)] for x in wanted]
+    trained = [setting for group in groups for setting in group]
+    runs = iter(runner.run(scenes, trained, out, samples, at_once=jobs, scheduler=scheduler))
+    found = [[next(runs) for _ in group] for _ in scenes for group in groups]
+    outcomes = [median_of(group) for group in found]
     record = {
         "preset": preset,
         "light": light,
@@ -106,7 +107,7 @@ def chart(
         "seeds": seeds,
         "points": [
             outcome.summary() | {"ranges": ranges(group)}
-            for outcome, group in zip(outcomes, groups, strict=True)
+            for outcome, group in zip(outcomes, found, strict=True)
         ],
         "fronts": fronts(outcomes),
         "published": [asdict(point) for point in PUBLISHED],
@@ -114,7 +115,7 @@ def chart(
     write_text(out / "chart.json", result_text(record))
     if any(not outcome.error for outcome in outcomes):
         plot(outcomes, out / "chart")
-    if failed := runner.failures(runs):
+    if failed := runner.failures([run for group in found for run in group]):
         raise ProcessFailed(failed)
     return out / "chart.png"
 

@@ -111,7 +111,7 @@ def chart(
         quick: train five settings instead of all
         only: names of the settings to train
         samples: light samples per pixel of relit images
-        seeds: training runs per scene and setting, with different random seeds; the results are
+        seeds: training runs of --preset per scene, with different random seeds; the results show
             their medians
         set: change one configuration field of all training runs; repeatable
         jobs: number of training runs at a time; more than one distorts the times

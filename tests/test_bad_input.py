@@ -266,7 +266,9 @@ def test_the_template_is_sound(run, tmp_path):
     assert main(["eval", str(run), *arguments]) == 0
     names = {"a.json", "contact_sheet.png", "r_0.exr", "r_1.exr", "trust.txt"}
     assert names == {p.name for p in out.iterdir()}
-    assert {"doubt.albedo", "doubt.roughness"} <= set(read_exr(out / "r_0.exr"))
-    assert 0 <= json.loads((out / "a.json").read_text())["trust"]["doubt_albedo"] <= 1
-    assert "Mean uncertainty over the surface" in (run / "trust.txt").read_text()
+    assert {f"expected_error.{x}" for x in ("albedo", "roughness", "normal")} <= set(
+        read_exr(out / "r_0.exr")
+    )
+    assert 0 <= json.loads((out / "a.json").read_text())["trust"]["albedo_error"] <= 1
+    assert "Expected error, mean over the surface" in (run / "trust.txt").read_text()
     assert read_image(run / "preview.png").shape == (16, 5 * 16, 3)

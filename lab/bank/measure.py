@@ -15,10 +15,10 @@ from lab.bank.scenes import HALVES, MIRROR, TRUTH
 from lab.record import Outcome
 from univoxel.core.files import read_json
 from univoxel.data import load_photos
-from univoxel.evaluation.confidence import Doubts
+from univoxel.evaluation.confidence import QUANTITIES, ExpectedErrors
 from univoxel.evaluation.measures import (
     albedo_scales,
-    doubts_and_errors,
+    errors_of,
     expected_view,
     render_layers,
 )
@@ -34,7 +34,11 @@ MEASURES = {
     "relit_psnr": ("relit, dB", 2),
     "normal_mae_deg": ("normals, degrees", 2),
 }
-RANKS = {"trust_spearman": "albedo", "trust_spearman_roughness": "roughness"}
+RANKS = {
+    "trust_spearman": "albedo",
+    "trust_spearman_roughness": "roughness",
+    "trust_spearman_normal": "normal",
+}
 # A scene's decisions that are yes or no, by key
 DECISIONS = {
     "all_metal": "all is metal",
@@ -48,7 +52,9 @@ SHARES = {"false_metal": "taken for metal", "false_mirror": "taken for a mirror"
 MATTE = 0.4  # roughness from which a surface without metal is matte
 LEAST = 0.01  # share of the object's pixels below which a piece of it is not asked about
 ALL, SOME = 0.95, 0.03  # shares from which all is metal, and something is a mirror
-BINS = 10  # of doubt, in [0, 1]
+# Bounds of the bins of expected errors, each a constant times the one before
+BOUNDS = {"albedo": (0.02, 0.2), "roughness": (0.05, 0.5), "normal": (1.5, 30.0)}
+BINS = 10
 
 
 @torch.no_grad()
@@ -62,12 +68,12 @@ def judged(run: Path, data: Path) -> dict[str, Any]:
     scene, _ = load_checkpoint(run)
     photos = load_photos(data, "test")
     scales, surveyed = albedo_scales(scene, photos), survey_of(scene, run, None)
-    doubts = Doubts(surveyed) if surveyed else None
-    layers, pairs = [], {"albedo": [], "roughness": []}
+    errors = ExpectedErrors(surveyed) if surveyed else None
+    layers, pairs = [], {name: [] for name in QUANTITIES}
     for view in range(len(photos)):
-        shown = render_layers(scene, photos.cameras, view, None, doubts)
-        found = doubts_and_errors(shown, expected_view(photos, {}, view), scales)
-        for key, pair in zip(pairs, found, strict=True):
+        shown = render_layers(scene, photos.cameras, view, None, errors)
+        found = errors_of(shown, expected_view(photos, {}, view), scales)
+        for key, pair in found.items():
             pairs[key] += [] if pair is None else [pair]
         surface, _ = surface_of_view(scene, photos.cameras, view)
         path = data / "test" / "gt" / f"{photos.names[view]}.npz"
@@ -83,7 +89,7 @@ def judged(run: Path, data: Path) -> dict[str, Any]:
         "all_metal": [truth["all_metal"], bool((metal > 0.5).mean() > ALL)],
         "mirrors": [bool((x < MIRROR).mean() > SOME) for x in (true_roughness, roughness)],
         **told_by(scene, truth),
-        "calibration": {key: binned(found) for key, found in pairs.items()},
+        "calibration": {key: binned(found, BOUNDS[key]) for key, found in pairs.items()},
     }
 
 
@@ -134,13 +140,20 @@ def share(which: np.ndarray, among: np.ndarray) -> float | None:
     return float(which[among].mean()) if among.mean() > LEAST else None
 
 
-def binned(pairs: Sequence[tuple[Tensor, Tensor]]) -> list[list[float]] | None:
-    """Number of pixels, sums of doubt and of error, in bins of doubt: [BINS, 3]."""
+def binned(
+    pairs: Sequence[tuple[Tensor, Tensor]], bounds: tuple[float, float]
+) -> list[list[float]] | None:
+    """Number of pixels, sums of expected and of true error, in bins of expected error: [BINS, 3].
+
+    Args:
+        bounds: of all bins; what lies beyond counts to the first and the last.
+    """
     if not pairs:
         return None
-    doubt, error = (torch.cat(x).double().numpy() for x in zip(*pairs, strict=True))
-    place = np.clip((BINS * doubt).astype(int), 0, BINS - 1)
-    sums = [np.bincount(place, w, BINS) for w in (None, doubt, error)]
+    told, true = (torch.cat(x).double().numpy() for x in zip(*pairs, strict=True))
+    edges = np.geomspace(*bounds, BINS + 1)[1:-1]
+    place = np.digitize(told, edges)
+    sums = [np.bincount(place, w, BINS) for w in (None, told, true)]
     return np.stack(sums, 1).round(4).tolist()
 
 
@@ -179,7 +192,7 @@ def summary(outcomes: Sequence[Outcome], found: Sequence[dict[str, Any] | None])
 
 
 def _pooled(tables: Sequence[list[list[float]] | None]) -> list[list[float | None]]:
-    """Share of the pixels, mean doubt and mean error in each bin; scenes count alike."""
+    """Share of the pixels, mean expected and mean true error in each bin; scenes count alike."""
     total = np.zeros((BINS, 3))
     known = [np.array(t) for t in tables if t is not None]
     for table in known:
@@ -214,14 +227,14 @@ def markdown(halves: Mapping[str, dict[str, Any]]) -> str:
     for key, title in SHARES.items():
         lines.append(row(f"share of matte surface {title}", [h["matte"][key] for h in every], 3))
     for measure, key in RANKS.items():
-        lines += ["", head.replace("| |", f"| uncertainty of {key} |", 1)]
+        lines += ["", head.replace("| |", f"| expected error of {key} |", 1)]
         ranks = [h["ranks"][measure] for h in every]
         lines.append(row("rank correlation with the error, mean of scenes", ranks))
         for k in range(BINS):
             cells = [h["calibration"][key][k] for h in every]
-            shown = [f"{_text(n, 2)}: {_text(e, 3)}" for n, _, e in cells]
-            lines.append(f"| {k / BINS:.1f} to {(k + 1) / BINS:.1f} | {' | '.join(shown)} |")
-    lines += ["", "By uncertainty: share of the pixels, and their mean error."]
+            shown = [f"{_text(n, 2)}: {_text(d, 3)}, {_text(e, 3)}" for n, d, e in cells]
+            lines.append(f"| bin {k + 1} | {' | '.join(shown)} |")
+    lines += ["", "By expected error: share of the pixels, their mean expected and true error."]
     return "\n".join(lines) + "\n"
 
 

@@ -161,8 +161,9 @@ def _chart(record: dict[str, Any], part: str) -> str:
     if part == "small":
         return _beside_baked(record)
     if part == "seeds":
-        rows = [((_scene(p["scene"]), f"`{p['setting']}`"), p["ranges"]) for p in record["points"]]
-        return measured(rows, ("scene", "preset"), (NVS, *ALBEDO, ROUGHNESS, RELIT, NORMALS))
+        rows = [((_scene(p["scene"]),), p["ranges"]) for p in record["points"]]
+        rows = [row for row in rows if any(row[1].values())]
+        return measured(rows, ("scene",), (NVS, *ALBEDO, ROUGHNESS, RELIT, NORMALS))
     columns = (SECONDS, NVS, *ALBEDO, ROUGHNESS, RELIT, NORMALS, MEMORY, ("file, MB", "mb", 1))
     columns = (*columns, ("planned steps made, %", "steps", 0))
     runs = [

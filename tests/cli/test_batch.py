@@ -120,7 +120,7 @@ def test_each_scene_has_all_of_its_results(night):
     words = {"good", "usable", "retake", "unfinished"}
     assert {ball["verdict"], cup["verdict"]} <= words
     assert set(ball["seconds"]) == {"train", "eval", "export", "page"}
-    assert 0 <= ball["doubts"]["doubt_albedo"] <= 1
+    assert 0 <= ball["expected"]["albedo_error"] <= 1
     rows = list(csv.DictReader((out / "batch.csv").read_text().splitlines()))
     assert [row["name"] for row in rows] == ["ball", "cup"]
     assert [row["verdict"] for row in rows] == [ball["verdict"], cup["verdict"]]

@@ -252,8 +252,8 @@ def test_an_empty_mesh_has_no_chamfer_distance(folders, relit_calls, monkeypatch
     assert task.evaluate(folders.run)["chamfer"] is None
 
 
-def test_doubts_are_compared_with_errors(folders, relit_calls, monkeypatch, tmp_path):
-    """Doubts that grow with the error foretell it; those that shrink say the opposite."""
+def test_expected_errors_are_compared_with_true_ones(folders, relit_calls):
+    """Expected errors that grow with the true ones foretell them; others say the opposite."""
     photos = load_photos(folders.data, "test")
     ones = measures.Scales(torch.ones(3), torch.ones(3))
     pairs = []
@@ -261,15 +261,14 @@ def test_doubts_are_compared_with_errors(folders, relit_calls, monkeypatch, tmp_
         layers = layers_module.render_layers(nn.Identity(), photos.cameras, view)
         expected = expected_view(photos, {}, view)
         error = (linear_to_srgb(layers.albedo) - expected.albedo).abs().mean(-1)
-        doubt = torch.stack([error.sqrt(), torch.zeros_like(error)], -1)
-        albedo, roughness = measures.doubts_and_errors(
-            dataclasses.replace(layers, doubt=doubt), expected, ones
-        )
-        assert len(albedo[0]) == int(inside().sum())
-        pairs.append((albedo, (-albedo[0], albedo[1]), roughness))
-    found = [measures.doubt_correlation(list(p)) for p in zip(*pairs, strict=True)]
+        told = torch.stack([error.sqrt(), 0 * error, 0 * error], -1)
+        errors = measures.errors_of(dataclasses.replace(layers, errors=told), expected, ones)
+        albedo = errors["albedo"]
+        assert len(albedo[0]) == len(errors["normal"][0]) == int(inside().sum())
+        pairs.append((albedo, (-albedo[0], albedo[1]), errors["roughness"]))
+    found = [measures.rank_correlation(list(p)) for p in zip(*pairs, strict=True)]
     assert found == [pytest.approx(1.0), pytest.approx(-1.0), None]  # the last are all equal
-    assert measures.doubt_correlation([None]) is None
+    assert measures.rank_correlation([None]) is None
 
 
 def test_other_data_can_be_named(folders, relit_calls):

@@ -1,5 +1,6 @@
 """What is said of a sphere whose cameras, light and material are known."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -9,8 +10,15 @@ from observed_points import RED, lamps, photographs_under
 
 from univoxel.data import Photos
 from univoxel.evaluation import confidence
-from univoxel.evaluation import confidence as task
-from univoxel.evaluation.confidence import Doubts, numbers, spread_observations, survey, words
+from univoxel.evaluation.confidence import (
+    QUANTITIES,
+    UNSEEN,
+    ExpectedErrors,
+    numbers,
+    spread_observations,
+    survey,
+    words,
+)
 from univoxel.render.observations import MIN_COSINE, Observations
 
 NODES, ROUGHNESS = 64, 0.4
@@ -67,14 +75,15 @@ def test_views_and_visibility_of_a_convex_body(surveyed, photos):
     assert not surveyed.black.any()
 
 
-def test_doubt_is_where_the_photographs_differ(scene, surveyed):
+def test_errors_are_expected_where_the_photographs_differ(scene, surveyed):
     """The sphere is red on one side, as the scene has it everywhere, and blue on the other."""
     red, blue = surveyed.position[:, 0] > 0.1, surveyed.position[:, 0] < -0.1
     assert surveyed.disagreement[red].mean() < 0.02
     assert surveyed.disagreement[blue].mean() > 0.1
-    assert surveyed.albedo[blue].mean() > surveyed.albedo[red].mean() + 0.2
-    assert (surveyed.roughness >= surveyed.albedo).all()
-    assert (surveyed.roughness <= 1).all()
+    albedo = surveyed.errors[:, 0]
+    assert albedo[blue].mean() > 1.5 * albedo[red].mean()
+    assert (surveyed.errors > 0).all()
+    assert (surveyed.errors <= torch.tensor(UNSEEN)).all()
 
 
 def test_what_no_camera_sees_is_a_guess(scene, photos):
@@ -82,8 +91,8 @@ def test_what_no_camera_sees_is_a_guess(scene, photos):
     surveyed = survey(scene, some_views(photos, ahead), 1000)
     below = surveyed.normal[:, 2] < -0.6
     assert (surveyed.views[below] == 0).all()
-    assert (surveyed.albedo[below] == 1).all()
-    assert (surveyed.roughness[below] == 1).all()
+    assert (surveyed.errors[below] == torch.tensor(UNSEEN)).all()
+    assert (surveyed.errors[surveyed.views > 3] < torch.tensor(UNSEEN)).any()
     figures = numbers(surveyed)
     assert 0.1 < figures["unseen"] <= figures["few_views"] < 0.9
     said = words(figures, [])
@@ -100,29 +109,42 @@ def test_clipped_and_black_pixels_say_nothing(scene):
         seen = surveyed.views > 0
         assert (share[seen] == 1).all()
         assert (surveyed.straight == 0).all()
-        assert (surveyed.albedo == 1).all()
     assert "overexposed in most photographs" in words(numbers(bright), [])
     assert "black in most photographs" in words(numbers(dark), [])
 
 
-def test_the_formula(surveyed):
+def test_each_term_counts_as_the_table_says(surveyed, monkeypatch):
+    """Twice the disagreement is 2^0.5 times the error where the weight is a half, and so on."""
+    weights = {"disagreement": 0.5, "visibility": -1.0, "clipped": 2.0}
+    table = {
+        "albedo": (-3.0, weights),
+        "roughness": (-2.0, {"information": 1.0}),
+        "normal": (1.0, {"spread": 1.0}),
+    }
+    monkeypatch.setattr(confidence, "EXPECTED", table)
     one = torch.ones(1)
     point = replace(
         surveyed,
-        views=9 * one,
-        straight=task.ENOUGH_VIEWS * one,
-        visibility=one,
-        disagreement=0 * one,
-        gloss=12**0.5 * task.NOISE * one,
+        **{name: one for name in ("views", "visibility", "straight", "bumpiness", "variation")},
+        **{name: 0 * one for name in ("clipped", "gloss")},
+        disagreement_nearby=0.01 * one,
+        spread=8 * one,
     )
-    assert point.albedo.item() == pytest.approx(0.5)
-    assert point.roughness.item() == pytest.approx(1 - 0.5 * 0.5**0.5)
-    shut = replace(point, visibility=0.4 * one)
-    assert shut.albedo.item() == pytest.approx(0.8)
-    wrong = replace(point, disagreement=task.NOISE * one)
-    assert wrong.albedo.item() == pytest.approx(0.75)
-    dull = replace(point, gloss=0 * one)
-    assert dull.roughness.item() == 1
+    told = point.errors[0]
+    expected = torch.tensor([math.exp(-3) * 0.01**0.5, math.exp(-2), 8 * math.e])
+    torch.testing.assert_close(told, expected)
+    for name, value, times in (
+        ("disagreement_nearby", 0.04, 2.0), ("visibility", 0.5, 2.0), ("clipped", 0.5, math.e),
+    ):  # fmt: skip
+        changed = replace(point, **{name: value * one}).errors[0, 0]
+        assert changed / told[0] == pytest.approx(times, rel=1e-4)
+    assert replace(point, spread=80 * one).errors[0, 2] == UNSEEN[2]
+
+
+def test_surroundings_do_not_depend_on_how_many_points_are_surveyed(scene, photos, surveyed):
+    few = survey(scene, photos, 100)
+    assert float(few.bumpiness.mean() / surveyed.bumpiness.mean()) == pytest.approx(1, abs=0.15)
+    assert surveyed.variation.max() < 1e-3  # it has one colour everywhere
 
 
 def test_the_report_names_its_thresholds(surveyed, monkeypatch):
@@ -147,31 +169,25 @@ def test_some_observations_are_spread_over_all():
     assert observation.tolist() == [0, 1, 2, 3, 7, 11, 15]
 
 
-def test_doubts_are_those_of_the_nearest_on_the_same_side(surveyed):
-    doubts = Doubts(surveyed)
-    exact = doubts.at(surveyed.position, surveyed.normal)
-    torch.testing.assert_close(exact[:, 0], surveyed.albedo, rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(exact[:, 1], surveyed.roughness, rtol=1e-4, atol=1e-4)
-    # A sheet of no thickness, well determined above and not at all below
+def test_expected_errors_are_those_of_the_nearest_on_the_same_side(surveyed):
+    found = ExpectedErrors(surveyed)
+    exact = found.at(surveyed.position, surveyed.normal)
+    torch.testing.assert_close(exact, surveyed.errors, rtol=1e-3, atol=1e-4)
+    # A sheet of no thickness: the camera sees what is above, and nothing below
     x = torch.rand(200, 2)
     top = torch.cat([x, torch.zeros(200, 1)], 1)
     up = torch.tensor([0.0, 0.0, 1.0]).expand(200, 3)
-    sheet = replace(
-        surveyed,
-        position=torch.cat([top, top]),
-        normal=torch.cat([up, -up]),
-        voxel_size=0.5,
-        **{
-            name: torch.cat([above * torch.ones(200), below * torch.ones(200)])
-            for name, above, below in (
-                ("views", 9, 0), ("straight", 1e6, 0.0), ("visibility", 1.0, 1.0),
-                ("disagreement", 0.0, 0.0), ("gloss", 1e3, 0.0),
-            )
-        },
-    )  # fmt: skip
-    doubts = Doubts(sheet)
-    assert doubts.at(top, up).max() < 0.01
-    assert doubts.at(top, -up).min() > 0.99
+    values = (
+        *(("views", 9), ("straight", 9.0), ("visibility", 1.0), ("disagreement_nearby", 0.0)),
+        *(("gloss", 1e3), ("bumpiness", 0.0), ("variation", 0.0), ("spread", 2), ("clipped", 0.0)),
+    )
+    same = {name: torch.full((400,), float(value)) for name, value in values}
+    same["views"][200:] = 0
+    position, normal = torch.cat([top, top]), torch.cat([up, -up])
+    sheet = replace(surveyed, position=position, normal=normal, voxel_size=0.5, **same)
+    found, guess = ExpectedErrors(sheet), torch.tensor(UNSEEN)
+    assert (found.at(top, up) < 0.5 * guess).all()
+    torch.testing.assert_close(found.at(top, -up), guess.expand(200, 3))
 
 
 def test_words_leave_out_what_is_not_the_case(surveyed):
@@ -179,7 +195,9 @@ def test_words_leave_out_what_is_not_the_case(surveyed):
     still = replace(surveyed, disagreement=agreeing, views=views)
     figures = numbers(still)
     said = words(figures, [])
-    assert said.startswith("Mean uncertainty over the surface: 0.")
+    assert said.startswith("Expected error, mean over the surface: 0.")
+    for name in QUANTITIES:
+        assert f"The {name} is good on {figures[f'{name}_good']:.0%} of the surface" in said
     assert "cameras" not in said
     assert "differs" not in said
     assert "Photographs cannot separate the brightness" in said

@@ -129,9 +129,9 @@ def test_photographs_stand_beside_their_render_the_worst_first(run, text):
     assert again.difference.max() == 0
 
 
-def test_doubt_is_painted_and_told(text):
+def test_expected_errors_are_painted_and_told(text):
     said = section(text, "Uncertainty")
-    assert "Mean uncertainty over the surface: 0." in said
+    assert "Expected error, mean over the surface: 0." in said
     names = [name for name, _ in pictures(said)]
     assert names == ["front", "right", "back", "left"]
 

@@ -111,7 +111,7 @@ def test_layers_are_the_materials(scene, subject, lamp, camera):
         "normal": 0.5 * surface.normal + 0.5,
         "depth": (1 - (depth - near) / (far - near))[:, None].expand(-1, 3),
     }
-    assert set(expected) == set(LAYERS) - {"render", "doubt"}
+    assert set(expected) == set(LAYERS) - {"render", "expected error"}
     for layer, values in expected.items():
         look = Look(viewpoints.lighting(lamp), layer)
         quick, *_, last = shown(refined_pictures(subject, camera, look))
@@ -121,12 +121,12 @@ def test_layers_are_the_materials(scene, subject, lamp, camera):
         assert difference.mean() < 0.02, layer  # triangles in place of the field
 
 
-def test_doubts_are_those_at_the_vertices(scene, subject, lamp, camera):
-    """Black where nothing is doubted, near white where all is; a plane of doubt is kept."""
+def test_expected_errors_are_those_at_the_vertices(scene, subject, lamp, camera):
+    """Black where no error is expected, near white where a large one is."""
     height = subject.traced.mesh.vertices[:, 2]
     known = replace(subject)
-    vars(known)["doubt"] = (height > 0).float()
-    look = Look(viewpoints.lighting(lamp), "doubt")
+    vars(known)["albedo_error"] = 0.2 * (height > 0)
+    look = Look(viewpoints.lighting(lamp), "expected error")
     (found,) = shown(refined_pictures(known, camera, look))
     surface, _ = surface_of_view(scene, camera, 0)
     up = surface.position[:, 2].reshape(SIZE, SIZE)
@@ -135,9 +135,9 @@ def test_doubts_are_those_at_the_vertices(scene, subject, lamp, camera):
     assert found[solid & (up < -0.05)][:, :3].mean() < 0.1
 
 
-def test_doubts_need_photographs(subject, lamp, camera):
+def test_expected_errors_need_photographs(subject, lamp, camera):
     with pytest.raises(UserError, match="photographs"):
-        quick_picture(subject, camera, Look(viewpoints.lighting(lamp), "doubt"))
+        quick_picture(subject, camera, Look(viewpoints.lighting(lamp), "expected error"))
 
 
 def test_a_mesh_may_be_coarser(scene):

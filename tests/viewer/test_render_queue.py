@@ -92,10 +92,10 @@ def test_one_leaves_in_the_middle_of_a_picture(studio, subject, light):
 
 
 def test_a_mistake_is_one_line_and_others_go_on(studio, subject, light):
-    """Doubts without photographs; then the same viewer asks for what there is."""
+    """Expected errors without photographs; then the same viewer asks for what there is."""
     cameras, watcher = orbit(subject.traced.mesh, 1, 64), Watcher()
     studio.join(watcher.viewer)
-    studio.ask(watcher.viewer, cameras, Look(light, "doubt"))
+    studio.ask(watcher.viewer, cameras, Look(light, "expected error"))
     watcher.wait(lambda: watcher.lines)
     assert len(watcher.lines) == 1
     assert "photographs" in watcher.lines[0]

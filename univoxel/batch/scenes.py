@@ -94,7 +94,7 @@ def bytes_of(data: Path, config: TrainConfig) -> int:
 # What came out of the scenes of a batch: records, batch.json and batch.csv.
 
 
-DOUBTS = ("doubt_albedo", "doubt_roughness")
+ERRORS = ("albedo_error", "roughness_error", "normal_error")
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class SceneResult:
     seconds: dict[str, float]  # spent in all sittings, by step
     verdict: Word | None = None  # None: it was not trained to an end
     measures: dict[str, float | int | None] = field(default_factory=dict)  # as in `evaluate`
-    doubts: dict[str, float] = field(default_factory=dict)  # means over the surface, in [0, 1]
+    expected: dict[str, float] = field(default_factory=dict)  # mean expected errors, see ERRORS
 
     @property
     def error(self) -> str:
@@ -129,8 +129,8 @@ def result_of(job: Job, data: Path, out: Path, ended: Result | None = None) -> S
     except (OSError, UserError):
         found = {}
     measures = {key: found[key] for key in MEASURES if key in found}
-    doubts = {key: found["trust"][key] for key in DOUBTS if key in found.get("trust", {})}
-    told = (errors, record["seconds"], verdict and verdict.word, measures, doubts)
+    expected = {key: found["trust"][key] for key in ERRORS if key in found.get("trust", {})}
+    told = (errors, record["seconds"], verdict and verdict.word, measures, expected)
     return SceneResult(job.name, str(data), job.name, state, *told)
 
 
@@ -148,12 +148,12 @@ def write_results(
     steps = dict.fromkeys(step for result in results for step in result.seconds)
     head = ("name", "state", "verdict", "error", *(f"{step}_s" for step in steps))
     with replacing(out / "batch.csv") as temporary, temporary.open("w", encoding="utf-8") as file:
-        rows = csv.DictWriter(file, (*head, *DOUBTS, *MEASURES), "", lineterminator="\n")
+        rows = csv.DictWriter(file, (*head, *ERRORS, *MEASURES), "", lineterminator="\n")
         rows.writeheader()
         for r in results:
             row = {"name": r.name, "state": r.state, "verdict": r.verdict, "error": r.error}
             seconds = {f"{step}_s": spent for step, spent in r.seconds.items()}
-            rows.writerow(row | seconds | r.doubts | r.measures)
+            rows.writerow(row | seconds | r.expected | r.measures)
 
 
 # A batch as one page: a picture of each scene, what was measured, how sure it is, what failed.
@@ -183,7 +183,7 @@ def write_sheet(results: Sequence[SceneResult], out: Path) -> Path:
     """Write out/index.html, which holds its pictures; return it. Failed scenes come first."""
     shown = [key for key in COLUMNS if any(r.measures.get(key) is not None for r in results)]
     heads = ["", "scene", "verdict", *(COLUMNS[key][0] for key in shown)]
-    heads += ["albedo uncertainty", "roughness uncertainty", "training", "all", ""]
+    heads += ["expected albedo error", "of roughness", "of normals", "training", "all", ""]
     ordered = sorted(results, key=lambda r: (WORSE_FIRST[r.state], r.name))
     counts = [(state, sum(r.state == state for r in results)) for state in WORSE_FIRST]
     about = ", ".join(f"{count} {state}" for state, count in counts if count)
@@ -199,7 +199,7 @@ def _row(result: SceneResult, shown: Sequence[str], out: Path) -> list[str]:
     cells = [_thumbnail(project.run / "preview.png"), _link(project.page, result.name, out)]
     cells.append(result.verdict or "-")
     cells += [_number(result.measures.get(key), COLUMNS[key][1]) for key in shown]
-    cells += [_number(result.doubts.get(key), 2) for key in ("doubt_albedo", "doubt_roughness")]
+    cells += [_number(result.expected.get(key), 0 if "normal" in key else 2) for key in ERRORS]
     whole = sum(result.seconds.values()) if result.seconds else None
     cells += [_number(spent, 0, " s") for spent in (result.seconds.get("train"), whole)]
     output = _link(out / LOGS / f"{result.name}.txt", "error message", out)

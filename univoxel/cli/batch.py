@@ -229,12 +229,12 @@ def table(results: Sequence[SceneResult]) -> Table:
     from rich.table import Table
 
     rows = Table("scene", "state", "verdict")
-    for head in ("novel views, dB", "albedo uncertainty", "seconds"):
+    for head in ("novel views, dB", "expected albedo error", "seconds"):
         rows.add_column(head, justify="right")
     rows.add_column("error")
     for r in results:
-        quality, doubt = r.measures.get("nvs_psnr"), r.doubts.get("doubt_albedo")
+        quality, error = r.measures.get("nvs_psnr"), r.expected.get("albedo_error")
         numbers = ("-" if quality is None else f"{quality:.1f}", f"{sum(r.seconds.values()):.0f}")
-        doubts = "-" if doubt is None else f"{doubt:.2f}"
-        rows.add_row(r.name, r.state, r.verdict or "-", numbers[0], doubts, numbers[1], r.error)
+        expected = "-" if error is None else f"{error:.2f}"
+        rows.add_row(r.name, r.state, r.verdict or "-", numbers[0], expected, numbers[1], r.error)
     return rows

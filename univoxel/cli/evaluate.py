@@ -87,11 +87,12 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
     The folder `save` gets <name>.exr for each view, contact_sheet.png, and trust.txt with that
     description. The channels are half floats: rgb.*, albedo.* and relit_<map>.* are linear,
     composited on black, and the albedo is not scaled; roughness, normal.* (in world space), depth
-    (along -Z), doubt.albedo and doubt.roughness (in [0, 1]) are 0 outside the object; alpha is the
-    opacity. With `full_size`, NAME_full.exr is written too, with rgb.* and alpha at the size of the
-    photograph, and the result has the keys of `univoxel.detail.views.FULL_MEASURES`. The file
-    `json` contains the metrics; `complete` and `verdict`, which are None if they are not known; and
-    the figures of trust.txt under the key trust.
+    (along -Z) and expected_error.albedo (in sRGB), .roughness and .normal (in degrees) are 0
+    outside the object; alpha is the opacity. With `full_size`, NAME_full.exr is written too, with
+    rgb.* and alpha at the size of the photograph, and the result has the keys of
+    `univoxel.detail.views.FULL_MEASURES`. The file `json` contains the metrics; `complete` and
+    `verdict`, which are None if they are not known; and the figures of trust.txt under the key
+    trust.
 
     Raises:
         DataError: the run or the data cannot be read.
@@ -105,10 +106,10 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
     from univoxel.evaluation import views
     from univoxel.evaluation.measures import (
         albedo_scales,
-        doubt_correlation,
         every_nth,
         load_scene_truth,
         mesh_chamfer,
+        rank_correlation,
     )
     from univoxel.render.pipeline import extract_mesh
     from univoxel.run import photos_of
@@ -138,8 +139,9 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
     result = {key: fmean(values) if values else None for key, values in found.measures.items()}
     result |= {
         "chamfer": mesh_chamfer(mesh, truth.points),
-        "trust_spearman": doubt_correlation(found.albedo_doubts),
-        "trust_spearman_roughness": doubt_correlation(found.roughness_doubts),
+        "trust_spearman": rank_correlation(found.errors["albedo"]),
+        "trust_spearman_roughness": rank_correlation(found.errors["roughness"]),
+        "trust_spearman_normal": rank_correlation(found.errors["normal"]),
         **_costs(run, scene, report),
     }
     if asked.full_size:

@@ -349,7 +349,7 @@ def bring_to_grid_(
 
 
 def trusted(scene: Scene, photos: Photos) -> Survey | None:
-    """What the photographs leave open; None if there is no surface that they show."""
+    """What the photographs tell of the surface; None if there is no surface that they show."""
     try:
         return survey(scene, photos, REPORT_POINTS)
     except UserError as error:
@@ -360,9 +360,9 @@ def trusted(scene: Scene, photos: Photos) -> Survey | None:
 def save_trust(
     verdict: Verdict, surveyed: Survey | None, troubles: list[str], cfg: config.TrainConfig
 ) -> None:
-    """Write the verdict and the uncertainty to the run's trust.txt."""
+    """Write the verdict and the expected errors to the run's trust.txt."""
     text = verdict.sentence() + "."
     if surveyed is not None:
-        log.debug(uncertain := words(numbers(surveyed), troubles))
-        text += " " + uncertain
+        log.debug(expected := words(numbers(surveyed), troubles))
+        text += " " + expected
     write_text(cfg.out / "trust.txt", text + "\n")

@@ -1,5 +1,5 @@
-"""How well the photographs determine a scene's materials, and what to photograph next: points of
-the surface, uncertainty anywhere, figures and words."""
+"""How wrong a scene's materials and normals are expected to be, and what to photograph next: points
+of the surface, expected errors anywhere, figures and words."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 from univoxel import brdf
 from univoxel.camera import Cameras
 from univoxel.color import CLIPPED, linear_to_srgb_unclipped
-from univoxel.core.records import Surface
+from univoxel.core.records import Mesh, Surface
 from univoxel.core.validation import check_settings, setting
 from univoxel.data import Photos
 from univoxel.ops import VisibilityScene
@@ -44,7 +44,7 @@ from univoxel.sphere import fibonacci_sphere, gaps, side_of
 # docs/method/detail.md explains the terms.
 
 
-POINTS = 20_000  # of the surface that evaluation surveys, for its maps of doubt
+POINTS = 20_000  # of the surface that evaluation surveys, for its maps of expected errors
 REPORT_POINTS = 2_000  # of the surface that are surveyed after training, for words only
 
 # Observations of a point that are rendered again, at most
@@ -53,12 +53,30 @@ OBSERVATIONS = 8
 DIRECTIONS = 64
 # Roughness over which the slope of the render is taken
 ROUGHNESS_STEP = 0.05
-# Views straight from above that determine an albedo to a doubt of one half
+# Views straight from above with which a place counts as half seen
 ENOUGH_VIEWS = 3.0
-# sRGB; disagreement with the photographs that means a doubt of one half
+# sRGB; disagreement with the photographs with which they count as half agreeing
 NOISE = 0.02
 # sRGB; darker pixels are noise
 BLACK = 0.02
+
+# Mean errors of places like this on rendered scenes: exp(constant + sum of weight * term), with the
+# terms of `Survey.errors`. Fitted to the tuning half of the bank
+QUANTITIES = ("albedo", "roughness", "normal")  # sRGB, as it is, degrees
+EXPECTED = {
+    "albedo": (
+        -1.43,
+        {"disagreement": 0.35, "visibility": -0.52, "variation": 0.13, "clipped": 1.26},
+    ),
+    "roughness": (-0.05, {"disagreement": 0.30, "visibility": 0.42, "information": 0.24}),
+    "normal": (0.47, {"bumpiness": 0.32, "visibility": -0.90, "spread": 0.75}),
+}
+# sRGB; an expected error of the albedo that pictures show brightest
+ALBEDO_LIMIT = 0.2
+# Where no photograph sees the surface; no expected error is larger
+UNSEEN = (0.2, 0.3, 30.0)
+# Points of the surface that bumpiness and variation are taken from, and how many lie around one
+AROUND_POINTS, AROUND = 20_000, 24
 
 
 @dataclass(frozen=True)
@@ -75,13 +93,34 @@ class Survey:
     black: Tensor  # share of them that are black there
     visibility: Tensor  # share of the light's directions, by cosine, that the object leaves open
     disagreement: Tensor  # mean absolute difference of photographs and render, sRGB
+    disagreement_nearby: Tensor  # its mean over the nearest points
+    bumpiness: Tensor  # 1 - mean cosine of the normal and those around
+    variation: Tensor  # standard deviation of the log albedo around, mean of the channels
     gloss: Tensor  # root of the sum over the views of (change of sRGB by roughness)^2
 
     @property
-    def albedo(self) -> Tensor:
-        """Uncertainty of the albedo, in [0, 1]: 1 - seen * visibility * agreeing."""
-        seen = self.seen_with(self.straight)
-        return torch.where(self.views > 0, 1 - seen * self.visibility * self.agreeing, 1.0)
+    def terms(self) -> dict[str, Tensor]:
+        """What expected errors depend on, [P] each."""
+        return {
+            "disagreement": self.disagreement_nearby.clamp_min(0.003).log(),
+            "visibility": self.visibility.clamp_min(0.05).log(),
+            "variation": self.variation.clamp_min(0.01).log(),
+            "bumpiness": self.bumpiness.clamp_min(1e-3).log(),
+            "spread": self.spread.clamp_min(2.0).log(),
+            "information": -(1 + self.information).log() / 2,
+            "clipped": self.clipped,
+        }
+
+    @property
+    def errors(self) -> Tensor:
+        """Expected errors [P, 3] of QUANTITIES, see EXPECTED."""
+        terms, found = self.terms, []
+        for guess, (constant, weights) in zip(UNSEEN, EXPECTED.values(), strict=True):
+            log_error = constant + sum(weight * terms[name] for name, weight in weights.items())
+            assert isinstance(log_error, Tensor)
+            error = log_error.exp().clamp_max(guess)
+            found.append(torch.where(self.views > 0, error, guess))
+        return torch.stack(found, 1)
 
     def seen_with(self, straight: Tensor) -> Tensor:
         """How well points are seen, [..., P] in [0, 1], with such sums of squared cosines."""
@@ -91,16 +130,6 @@ class Survey:
     def agreeing(self) -> Tensor:
         """How well render and photographs agree, in (0, 1]."""
         return NOISE / (self.disagreement + NOISE)
-
-    @property
-    def roughness(self) -> Tensor:
-        """Uncertainty of the roughness, in [0, 1]: 1 - seen * visibility * agreeing * glossy.
-
-        glossy^2 is the share by which the photographs reduce the variance of the roughness, which
-        is uniform in [0, 1] before.
-        """
-        information = self.information
-        return 1 - (1 - self.albedo) * (information / (1 + information)).sqrt()
 
     @property
     def information(self) -> Tensor:
@@ -148,6 +177,10 @@ def survey(scene: Scene, photos: Photos, points: int) -> Survey:
     spread = torch.where(counts > 0, mean_length.acos().rad2deg(), 0.0)
     compared = spread_observations(observations, OBSERVATIONS)
     disagreement, gloss = compare(scene, observations, transport, compared, ROUGHNESS_STEP)
+    key = key_of(position, normal, offset)
+    count = min(points, max(1, AROUND * points // AROUND_POINTS))
+    nearest = KDTree(key).query(key, k=count, workers=-1)[1].reshape(points, count)
+    bumpiness, variation = surroundings(scene, mesh, position, normal)
     return Survey(
         position=position,
         normal=normal,
@@ -159,8 +192,29 @@ def survey(scene: Scene, photos: Photos, points: int) -> Survey:
         black=total(black.float()) / at_least_one,
         visibility=visibility,
         disagreement=disagreement,
+        disagreement_nearby=disagreement[torch.from_numpy(nearest)].mean(1),
+        bumpiness=bumpiness,
+        variation=variation,
         gloss=gloss * counts.sqrt(),
     )
+
+
+def surroundings(
+    scene: Scene, mesh: Mesh, position: Tensor, normal: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Bumpiness and variation of the albedo around points [P, 3] of a mesh: [P] each, see `Survey`.
+
+    What counts as around depends on the size of the object alone.
+    """
+    voxel_size, generator = scene.field.voxel_size, torch.Generator().manual_seed(0)
+    near, near_normal = surface_points(mesh, AROUND_POINTS, generator)
+    log_albedo = scene.material(scene.field.features_at(near))[0].clamp_min(0.01).log().mean(1)
+    around = KDTree(near.numpy()).query(position.numpy(), k=AROUND, workers=-1)[1]
+    cosine = (near_normal[torch.from_numpy(around)] * normal[:, None]).sum(2)
+    # Paint on the other side of a thin part is none of a point's surroundings
+    tree = KDTree(key_of(near, near_normal, voxel_size))
+    same_side = tree.query(key_of(position, normal, voxel_size), k=AROUND, workers=-1)[1]
+    return 1 - cosine.mean(1), log_albedo[torch.from_numpy(same_side)].std(1)
 
 
 def spread_observations(observations: Observations, most: int) -> tuple[Tensor, Tensor]:
@@ -250,41 +304,48 @@ def render(
     return shade_observations(scene, problem, point, observation, *shaded)
 
 
-# Doubt of albedo and roughness anywhere on the surface.
+# Expected errors anywhere on the surface.
 
 
-# Voxels, over 2, that opposite sides of a thin part count as farther apart: a pixel takes its doubt
-# from its own side
+# Voxels, over 2, that opposite sides of a thin part count as farther apart: a pixel takes its
+# expected error from its own side
 NORMAL_SCALE = 3.0
-# Nearest points that a pixel takes its doubt from
+# Nearest points that a pixel takes its expected error from
 NEIGHBOURS = 4
 
 
-class Doubts:
-    """Uncertainty of a survey, which can be looked up anywhere on the surface."""
+def key_of(position: Tensor, normal: Tensor, voxel_size: float) -> np.ndarray:
+    """Where points [P, 3] lie for a search of the nearest ones on the same side: [P, 6]."""
+    return torch.cat([position, NORMAL_SCALE * voxel_size * normal], 1).numpy()
+
+
+class ExpectedErrors:
+    """Expected errors of a survey, which can be looked up anywhere on the surface."""
 
     def __init__(self, surveyed: Survey) -> None:
-        self._scale = NORMAL_SCALE * surveyed.voxel_size
-        self._values = torch.stack([surveyed.albedo, surveyed.roughness], 1)
-        self._tree = KDTree(self._key(surveyed.position, surveyed.normal))
+        self._voxel_size = surveyed.voxel_size
+        self._values = surveyed.errors
+        self._tree = KDTree(key_of(surveyed.position, surveyed.normal, self._voxel_size))
 
     def at(self, position: Tensor, normal: Tensor) -> Tensor:
-        """Doubt of albedo and of roughness [N, 2] at points [N, 3] with normals [N, 3]: the mean
-        of the nearest points, weighted by the inverse squared distance."""
+        """Expected errors [N, 3] of QUANTITIES at points [N, 3] with normals [N, 3]: the mean of
+        the nearest points, weighted by the inverse squared distance."""
         count = min(NEIGHBOURS, len(self._values))
-        nearest = self._tree.query(self._key(position, normal), k=count, workers=-1)
+        key = key_of(position, normal, self._voxel_size)
+        nearest = self._tree.query(key, k=count, workers=-1)
         distance, index = (torch.from_numpy(x.reshape(-1, count)) for x in map(np.asarray, nearest))
         weight = 1 / (distance.square() + 1e-12)
         weight = (weight / weight.sum(1, keepdim=True)).float()
         return (self._values[index] * weight[..., None]).sum(1)
 
-    def _key(self, position: Tensor, normal: Tensor) -> np.ndarray:
-        return torch.cat([position, self._scale * normal], 1).numpy()
-
 
 # A survey in figures and in words.
 
 
+# Expected error below which a place counts as good, and the error below which nine of ten such
+# places were on the judging half of the bank
+GOOD = {"albedo": (0.05, 0.1), "roughness": (0.12, 0.2), "normal": (6.0, 10.0)}
+UNITS = {"albedo": "", "roughness": "", "normal": " degrees"}
 # Views; a material that fewer see is reported as a guess
 FEW_VIEWS = 3
 # Degrees of spread; views within are reported as one direction
@@ -305,9 +366,10 @@ def numbers(surveyed: Survey) -> dict[str, float]:
         return where.float().mean().item()
 
     seen = surveyed.views > 0
+    errors = dict(zip(QUANTITIES, surveyed.errors.unbind(1), strict=True))
     return {
-        "doubt_albedo": surveyed.albedo.mean().item(),
-        "doubt_roughness": surveyed.roughness.mean().item(),
+        **{f"{name}_error": error.mean().item() for name, error in errors.items()},
+        **{f"{name}_good": share(error < GOOD[name][0]) for name, error in errors.items()},
         "unseen": share(~seen),
         "few_views": share(surveyed.views < FEW_VIEWS),
         "one_side": share(seen & (surveyed.spread < ONE_SIDE)),
@@ -326,8 +388,14 @@ def words(figures: dict[str, float], troubles: list[str]) -> str:
         troubles: what went wrong in training, from its state.
     """
     sentences = [
-        f"Mean uncertainty over the surface: {figures['doubt_albedo']:.2f} for the albedo, "
-        f"{figures['doubt_roughness']:.2f} for the roughness (0: well determined, 1: a guess)."
+        f"Expected error, mean over the surface: {figures['albedo_error']:.2f} for the albedo (in "
+        f"sRGB), {figures['roughness_error']:.2f} for the roughness, {figures['normal_error']:.0f} "
+        "degrees for the normals.",
+        *(
+            f"The {name} is good on {figures[f'{name}_good']:.0%} of the surface: on rendered "
+            f"scenes, nine of ten such places have an error below {limit:g}{UNITS[name]}."
+            for name, (_, limit) in GOOD.items()
+        ),
     ]
     shares = {
         "few_views": f"is seen by fewer than {FEW_VIEWS} cameras: its materials are a guess",
@@ -354,11 +422,11 @@ def words(figures: dict[str, float], troubles: list[str]) -> str:
     return " ".join(sentences)
 
 
-# What to photograph next: the directions from which most of what is in doubt would be seen.
+# What to photograph next: the directions from which most of what is badly seen would be seen.
 #
-# A photograph is worth what it adds to how well the surface is seen, see `Survey.seen`, over points
-# weighted by their doubt. Directions are taken one after another, the best first, each with those
-# before it taken as photographs. No truth is read.
+# A photograph is worth what it adds to how well the surface is seen, see `Survey.seen_with`, over
+# points weighted by how little is known of them. Directions are taken one after another, the best
+# first, each with those before it taken as photographs. No truth is read.
 
 
 # Directions that are weighed, on the whole sphere

@@ -17,15 +17,13 @@ from univoxel.data import Photos, Truth, load_points, load_relit, load_truth, re
 from univoxel.data.photos import decode
 from univoxel.envmap import EnvMap, read_map
 from univoxel.errors import DataError, UserError
-from univoxel.evaluation.confidence import Doubts
+from univoxel.evaluation.confidence import QUANTITIES, ExpectedErrors
 from univoxel.lights.views import ShownLight, ViewLights
 from univoxel.optim import RowAdam, geometric
 from univoxel.render import metrics
 from univoxel.render.pipeline import at_rays, shade, surface_of_view
 from univoxel.render.relight import Lighting, TracedMesh, relight_surface
 from univoxel.scene import Scene
-
-DOUBTS = ("albedo", "roughness")
 
 
 @dataclass(frozen=True)
@@ -40,7 +38,7 @@ class Layers:
     depth: Tensor  # [H, W] along the camera's -Z, world units, 0 where there is nothing
     relit: dict[str, Tensor]  # [H, W, 3] by map
     relit_scaled: dict[str, Tensor]  # the same with the scaled albedo
-    doubt: Tensor | None = None  # [H, W, 2] in [0, 1] of albedo and roughness, 0 where nothing is
+    errors: Tensor | None = None  # [H, W, 3] as expected, of QUANTITIES, 0 where there is nothing
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ def render_layers(
     cameras: Cameras,
     view: int,
     relighting: Relighting | None = None,
-    doubts: Doubts | None = None,
+    expected: ExpectedErrors | None = None,
     albedo_near: AlbedoNear | None = None,
 ) -> Layers:
     """Render one view. Nothing is shaded where the opacity is 0.
@@ -100,15 +98,16 @@ def render_layers(
         depth=picture(surface.depth * (wo @ backward)),
         relit=relit,
         relit_scaled=relit_scaled,
-        doubt=picture(doubts.at(surface.position, surface.normal)) if doubts else None,
+        errors=picture(expected.at(surface.position, surface.normal)) if expected else None,
     )
 
 
 def exr_channels(layers: Layers) -> dict[str, Tensor]:
     """The channels of a saved EXR file, [H, W] each: rgb.R, normal.X, relit_<map>.R and so on."""
     channels = {"alpha": layers.alpha, "depth": layers.depth, "roughness": layers.roughness}
-    if layers.doubt is not None:
-        channels |= {f"doubt.{c}": layers.doubt[..., k] for k, c in enumerate(DOUBTS)}
+    if layers.errors is not None:
+        names = (f"expected_error.{quantity}" for quantity in QUANTITIES)
+        channels |= dict(zip(names, layers.errors.unbind(-1), strict=True))
     colors = {"rgb": layers.rgb, "albedo": layers.albedo}
     colors |= {f"relit_{name}": rgb for name, rgb in layers.relit.items()}
     for name, value in colors.items():
@@ -289,9 +288,9 @@ def _check_size(photos: Photos, view: int, picture: Tensor, what: str) -> None:
 # albedo_psnr_fg: as _3ch, over the pixels of the mask only. - relit_psnr: rendered with the albedo
 # times the scale per channel, clipped to 1, on the surface   and on what it sees of itself;
 # relit_psnr_raw: with the albedo as it is. - chamfer: samples of the mesh against points of the
-# true surface. - trust_spearman: of doubt (see `univoxel.evaluation.confidence`) and error over the
-# pixels of the mask   in all views: of the albedo, with a scale per channel, mean absolute
-# difference in sRGB; of the   roughness, absolute difference.
+# true surface. - trust_spearman: of the expected error (see `univoxel.evaluation.confidence`) and
+# the true one over the pixels of the mask in all views: of the albedo, with a scale per channel,
+# mean absolute difference in sRGB; of the roughness, absolute difference; of normals, the angle.
 
 
 # Description of each key in the table
@@ -307,8 +306,9 @@ MEASURES = {
     "relit_psnr_raw": "relit PSNR, dB, albedo not scaled",
     "normal_mae_deg": "normals, mean error inside the mask, degrees",
     "chamfer": "Chamfer distance, world units",
-    "trust_spearman": "rank correlation between albedo uncertainty and error",
-    "trust_spearman_roughness": "rank correlation between roughness uncertainty and error",
+    "trust_spearman": "rank correlation of expected and true error, albedo",
+    "trust_spearman_roughness": "rank correlation of expected and true error, roughness",
+    "trust_spearman_normal": "rank correlation of expected and true error, normals",
     "train_seconds": "training, seconds",
     "threads": "threads in training",
     "peak_rss_mb": "peak memory in training, MB",
@@ -330,7 +330,7 @@ def _text(value: float | int | None) -> str:
 
 SURFACE_POINTS = 100_000  # samples of the mesh for the Chamfer distance, at most
 
-Pairs: TypeAlias = tuple[Tensor, Tensor] | None  # doubts and errors, [N] each
+Pairs: TypeAlias = tuple[Tensor, Tensor] | None  # expected and true errors, [N] each
 
 
 @dataclass(frozen=True)
@@ -371,29 +371,35 @@ def score(layers: Layers, expected: Expected, scales: Scales) -> list[tuple[str,
     return found
 
 
-def doubts_and_errors(layers: Layers, expected: Expected, scales: Scales) -> tuple[Pairs, Pairs]:
-    """Doubts and errors in the mask of a view, of albedo and of roughness, where there is truth."""
-    truth, doubt = expected.truth, layers.doubt
-    if doubt is None or truth.mask is None:
-        return None, None
-    there = truth.mask & (layers.alpha > 0)
-    albedo, roughness = None, None
+def errors_of(layers: Layers, expected: Expected, scales: Scales) -> dict[str, Pairs]:
+    """Expected and true errors in the mask of a view by quantity, None where there is no truth."""
+    truth = expected.truth
+    found: dict[str, Pairs] = dict.fromkeys(QUANTITIES)
+    if layers.errors is None or truth.mask is None:
+        return found
+    true = {}
     if expected.albedo is not None:
-        error = (linear_to_srgb(layers.albedo * scales.three) - expected.albedo).abs().mean(-1)
-        albedo = doubt[there][:, 0], error[there]
+        difference = linear_to_srgb(layers.albedo * scales.three) - expected.albedo
+        true["albedo"] = difference.abs().mean(-1)
     if truth.roughness is not None:
-        error = (layers.roughness - truth.roughness).abs()
-        roughness = doubt[there][:, 1], error[there]
-    return albedo, roughness
+        true["roughness"] = (layers.roughness - truth.roughness).abs()
+    if truth.normal is not None:
+        cosine = (layers.normal * truth.normal).sum(-1).clamp(-1, 1)
+        true["normal"] = cosine.acos().rad2deg()
+    there = truth.mask & (layers.alpha > 0)
+    for k, name in enumerate(QUANTITIES):
+        if name in true:
+            found[name] = layers.errors[there][:, k], true[name][there]
+    return found
 
 
-def doubt_correlation(pairs: list[Pairs]) -> float | None:
-    """Rank correlation of doubts and errors over all views; None if there is no truth."""
+def rank_correlation(pairs: list[Pairs]) -> float | None:
+    """Of expected and true errors over all views; None if there is no truth."""
     known = [pair for pair in pairs if pair is not None]
     if not known:
         return None
-    doubt, error = (torch.cat(part) for part in zip(*known, strict=True))
-    return metrics.spearman(doubt, error)
+    told, true = (torch.cat(part) for part in zip(*known, strict=True))
+    return metrics.spearman(told, true)
 
 
 def albedo_scales(scene: Scene, photos: Photos, albedo_near: AlbedoNear | None = None) -> Scales:

@@ -1,4 +1,4 @@
-"""Test views of a scene against their ground truth: metrics, images, uncertainty."""
+"""Test views of a scene against their ground truth: metrics, images, expected errors."""
 
 from __future__ import annotations
 
@@ -18,7 +18,15 @@ from univoxel.data import Photos
 from univoxel.data.images import write_exr, write_png
 from univoxel.envmap import tables
 from univoxel.errors import UserError
-from univoxel.evaluation.confidence import POINTS, Doubts, Survey, numbers, survey, words
+from univoxel.evaluation.confidence import (
+    POINTS,
+    QUANTITIES,
+    ExpectedErrors,
+    Survey,
+    numbers,
+    survey,
+    words,
+)
 from univoxel.evaluation.measures import (
     MEASURES,
     Expected,
@@ -27,7 +35,7 @@ from univoxel.evaluation.measures import (
     Relighting,
     Scales,
     SceneTruth,
-    doubts_and_errors,
+    errors_of,
     expected_view,
     exr_channels,
     fit_light_,
@@ -48,8 +56,7 @@ class ViewMeasures:
     """What the test views say, view by view."""
 
     measures: dict[str, list[float]]  # by key
-    albedo_doubts: list[Pairs]
-    roughness_doubts: list[Pairs]
+    errors: dict[str, list[Pairs]]  # by quantity
 
 
 def relighting_of(
@@ -82,20 +89,19 @@ def measure_views(
         fit_light: each is rendered in the light that fits its photograph.
         albedo_near: as in `render_layers`.
     """
-    doubts = Doubts(surveyed) if surveyed else None
-    found = ViewMeasures({key: [] for key in MEASURES}, [], [])
+    errors = ExpectedErrors(surveyed) if surveyed else None
+    found = ViewMeasures({key: [] for key in MEASURES}, {name: [] for name in QUANTITIES})
     every = -(-len(photos) // SHEET_ROWS)
     rows = []
     for view in track(range(len(photos)), "rendering test views"):
         if fit_light:
             fit_light_(scene, photos, view, albedo_near)
-        layers = render_layers(scene, photos.cameras, view, relighting, doubts, albedo_near)
+        layers = render_layers(scene, photos.cameras, view, relighting, errors, albedo_near)
         expected = expected_view(photos, truth.relit, view, background)
         for key, value in score(layers, expected, scales):
             found.measures[key].append(value)
-        albedo, roughness = doubts_and_errors(layers, expected, scales)
-        found.albedo_doubts.append(albedo)
-        found.roughness_doubts.append(roughness)
+        for name, pairs in errors_of(layers, expected, scales).items():
+            found.errors[name].append(pairs)
         if save:
             write_exr(save / f"{photos.names[view]}.exr", exr_channels(layers))
             if view % every == 0:
@@ -149,11 +155,13 @@ def panels_of_view(layers: Layers, expected: Expected, scales: Scales) -> list[P
             " degrees",
         ),
     ]
-    if layers.doubt is not None:  # beside the error that it should predict
-        albedo, rough = (torch.from_numpy(heat(x, 1.0)) for x in layers.doubt.unbind(-1))
-        heads = ("roughness uncertainty", "albedo error")
+    if layers.errors is not None:  # in the colours of the errors that they should predict
+        albedo = torch.from_numpy(heat(layers.errors[..., 0], COLOR_LIMIT))
+        rough = torch.from_numpy(heat(layers.errors[..., 1], ROUGHNESS_LIMIT))
+        heads = ("expected roughness error", "albedo error")
         error = panels[1].error
-        panels.append(Panel("albedo uncertainty", albedo, rough, error, COLOR_LIMIT, heads=heads))
+        title = "expected albedo error"
+        panels.append(Panel(title, albedo, rough, error, COLOR_LIMIT, heads=heads))
     panels += [
         colors(f"under {name}", layers.relit_scaled[name], photo)
         for name, photo in expected.relit.items()
@@ -173,7 +181,8 @@ def survey_of(scene: Scene, run: Path, data: Path | None) -> Survey | None:
 def say_trust(
     surveyed: Survey | None, troubles: list[str], save: Path | None
 ) -> dict[str, dict[str, float]]:
-    """Log the uncertainty, and write it to `save`; return its figures under the key trust."""
+    """Log the expected errors, and write them to `save`; return their figures under the key
+    trust."""
     if surveyed is None:
         return {}
     figures = numbers(surveyed)

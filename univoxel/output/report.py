@@ -25,10 +25,11 @@ from univoxel.core.records import AlbedoNear, Mesh
 from univoxel.errors import UserError
 from univoxel.evaluation.confidence import (
     ADVICE,
+    ALBEDO_LIMIT,
     POINTS,
     Advice,
     AdviceConfig,
-    Doubts,
+    ExpectedErrors,
     Survey,
     advise,
     in_words,
@@ -235,13 +236,13 @@ def report_text(
         why = f"The photographs could not be read, so this part is missing: {error}."
     title = options.title or run.resolve().name or "univoxel"
     front = START[0] if known is None else known.advice.front
-    doubts = None if known is None else Doubts(known.surveyed)
-    pictures = report_pictures.layers(scene, mesh, options.size, front, doubts, options.albedo_near)
+    errors = None if known is None else ExpectedErrors(known.surveyed)
+    pictures = report_pictures.layers(scene, mesh, options.size, front, errors, options.albedo_near)
     verdict = load_verdict(run)
     sections = [
         ("Result", paragraph(verdict.sentence() + ".") if verdict else ""),
         ("What to photograph next", next_section(known.advice) if known else paragraph(why)),
-        ("Uncertainty", doubt_section(known, state, pictures.pop("doubt", [])) if known else ""),
+        ("Uncertainty", error_section(known, state, pictures.pop("error", [])) if known else ""),
         ("Photographs and renders", views_section(scene, known, options) if known else ""),
         ("Materials", materials_section(pictures)),
         ("Light", light_section(scene, mesh)),
@@ -309,10 +310,10 @@ def next_section(advice: Advice) -> str:
     return f'<div class="beside"><div>{left}</div>{figure}</div>'
 
 
-def doubt_section(known: Known, state: dict[str, Any], pictures: Sequence[Tensor]) -> str:
-    """The uncertainty, in words and painted on the object."""
+def error_section(known: Known, state: dict[str, Any], pictures: Sequence[Tensor]) -> str:
+    """Expected errors, in words and painted on the object."""
     text = words(numbers(known.surveyed), list(state.get("troubles", [])))
-    legend = "Uncertainty of the albedo: black is well determined, white is a guess."
+    legend = f"Expected error of the albedo: black is 0, white is {ALBEDO_LIMIT:g} in sRGB or more."
     return paragraph(text) + gallery(zip(report_pictures.SIDES, pictures, strict=True), legend)
 
 

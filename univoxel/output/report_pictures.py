@@ -17,7 +17,13 @@ from univoxel.core.html import escape
 from univoxel.core.progress_bar import track
 from univoxel.core.records import AlbedoNear, Mesh, Surface
 from univoxel.data import Photos
-from univoxel.evaluation.confidence import Advice, Doubts, azimuths, elevations
+from univoxel.evaluation.confidence import (
+    ALBEDO_LIMIT,
+    Advice,
+    ExpectedErrors,
+    azimuths,
+    elevations,
+)
 from univoxel.lights import AbstractLocalLight
 from univoxel.output.viewpoints import orbit
 from univoxel.render.metrics import psnr
@@ -131,11 +137,11 @@ def layers(
     mesh: Mesh,
     size: int,
     front: float,
-    doubts: Doubts | None,
+    errors: ExpectedErrors | None,
     albedo_near: AlbedoNear | None = None,
 ) -> dict[str, list[Tensor]]:
     """Pictures [size, size, 3], sRGB, of each of SIDES, by layer: render, albedo, roughness, metal
-    where there is any, normal, and doubt where it is known.
+    where there is any, normal, and the expected error of the albedo where it is known.
 
     Args:
         front: azimuth of the front, degrees from +X.
@@ -144,7 +150,7 @@ def layers(
     cameras = orbit(mesh, len(SIDES), size, ELEVATION, front)
     found: dict[str, list[Tensor]] = {}
     for view in track(range(len(SIDES)), "rendering layers"):
-        for name, picture in _of_view(scene, cameras, view, doubts, albedo_near):
+        for name, picture in _of_view(scene, cameras, view, errors, albedo_near):
             found.setdefault(name, []).append(picture)
     if not any(bool((picture > BEHIND + 0.05).any()) for picture in found["metal"]):
         del found["metal"]
@@ -152,7 +158,11 @@ def layers(
 
 
 def _of_view(
-    scene: Scene, cameras: Cameras, view: int, doubts: Doubts | None, albedo_near: AlbedoNear | None
+    scene: Scene,
+    cameras: Cameras,
+    view: int,
+    errors: ExpectedErrors | None,
+    albedo_near: AlbedoNear | None,
 ) -> Iterator[tuple[str, Tensor]]:
     surface, wo = surface_of_view(scene, cameras, view, albedo_near)
     width, height = cameras.size(view)
@@ -171,11 +181,11 @@ def _of_view(
     metal = metal_or_none(surface.metallic)
     yield "metal", plain((torch.zeros_like(alpha) if metal is None else metal) * (1 - BEHIND))
     yield "normal", plain(0.5 * surface.normal + 0.5)
-    if doubts is not None:
+    if errors is not None:
         met = (surface.opacity > 0).nonzero()[:, 0]
-        doubt = torch.zeros_like(surface.opacity)
-        doubt[met] = doubts.at(surface.position[met], surface.normal[met])[:, 0].clamp(0, 1)
-        yield "doubt", plain(torch.from_numpy(heat(doubt, 1.0)).float())
+        error = torch.zeros_like(surface.opacity)
+        error[met] = errors.at(surface.position[met], surface.normal[met])[:, 0]
+        yield "error", plain(torch.from_numpy(heat(error, ALBEDO_LIMIT)).float())
 
 
 # The light that was recovered, as one map, whichever model of light it is.

@@ -18,6 +18,7 @@ from univoxel.camera import Cameras, image_rays
 from univoxel.color import linear_to_srgb
 from univoxel.core.choices import BOUNCES
 from univoxel.core.records import Rays, Surface
+from univoxel.evaluation.confidence import ALBEDO_LIMIT
 from univoxel.render.pictures import heat
 from univoxel.render.pipeline import at_rays, surface_at
 from univoxel.render.relight import Lighting, ground_shadow, relight_surface
@@ -64,7 +65,9 @@ def denoised(
     return light, torch.from_numpy(grey)[..., 0].clamp(0, 1)
 
 
-Layer: TypeAlias = Literal["render", "albedo", "roughness", "metal", "normal", "depth", "doubt"]
+Layer: TypeAlias = Literal[
+    "render", "albedo", "roughness", "metal", "normal", "depth", "expected error"
+]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
 
 QUICK_SAMPLES = 2  # of the light a pixel, while something moves
@@ -94,12 +97,14 @@ def quick_picture(subject: Subject, cameras: Cameras, look: Look) -> Tensor:
     """View 0 with few samples, from the mesh only: [H, W, 4] sRGB with straight alpha.
 
     Raises:
-        UserError: doubts are asked for, and the photographs are not there.
+        UserError: expected errors are asked for, and the photographs are not there.
     """
     rays = image_rays(cameras, 0)
     surface, wo, hit = surface_along(subject, rays)
-    if look.layer == "doubt":  # in the colours of `univoxel eval`
-        colors = torch.from_numpy(heat(at_hits(subject.traced.mesh, hit, subject.doubt), 1.0))
+    if look.layer == "expected error":  # in the colours of `univoxel eval`
+        colors = torch.from_numpy(
+            heat(at_hits(subject.traced.mesh, hit, subject.albedo_error), ALBEDO_LIMIT)
+        )
         return _grid(cameras, torch.cat([colors.float(), surface.opacity[:, None]], 1))
     if look.layer != "render":
         return _layer(subject, cameras, look.layer, surface)
@@ -128,7 +133,7 @@ def refined_pictures(
         samples: of the light per pixel, after which it ends.
     """
     yield quick_picture(subject, cameras, look)
-    if look.layer == "doubt":
+    if look.layer == "expected error":
         return
     rays = image_rays(cameras, 0)
     steps = []
@@ -283,7 +288,7 @@ def _composed(
 
 
 def _layer(subject: Subject, cameras: Cameras, layer: Layer, surface: Surface) -> Tensor:
-    """A layer but for render and doubt: [H, W, 4] sRGB with straight alpha."""
+    """A layer but for render and expected error: [H, W, 4] sRGB with straight alpha."""
     match layer:
         case "albedo":
             values = linear_to_srgb(surface.albedo)

@@ -15,7 +15,7 @@ from univoxel.color import linear_to_srgb
 from univoxel.core.records import Mesh, Rays, Surface
 from univoxel.data import Photos
 from univoxel.errors import UserError
-from univoxel.evaluation.confidence import POINTS, Doubts, survey
+from univoxel.evaluation.confidence import POINTS, ExpectedErrors, survey
 from univoxel.ops.visibility import Hit
 from univoxel.output.mesh import with_materials
 from univoxel.output.surface import cameras_of, surface_of
@@ -58,12 +58,12 @@ class Subject:
         return self.scene.registered(photos_of(self.run, split="train"))
 
     @cached_property
-    def doubt(self) -> Tensor:
-        """What `photos` leave open of the albedo at the mesh's vertices: [P] in [0, 1]."""
-        found = Doubts(survey(self.scene, self.photos, POINTS))
+    def albedo_error(self) -> Tensor:
+        """Expected error of the albedo at the mesh's vertices: [P], sRGB."""
+        found = ExpectedErrors(survey(self.scene, self.photos, POINTS))
         mesh = self.traced.mesh
         assert mesh.normals is not None
-        return found.at(mesh.vertices, mesh.normals)[:, 0].clamp(0, 1)
+        return found.at(mesh.vertices, mesh.normals)[:, 0]
 
 
 def subject_of(run: Path) -> Subject:

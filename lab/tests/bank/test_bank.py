@@ -126,17 +126,18 @@ def test_pieces_are_told_by_what_most_of_them_is():
 
 
 def test_bins_hold_all_pixels_and_their_errors():
-    doubt, error = torch.tensor([0.05, 0.05, 0.55, 1.0]), torch.tensor([0.1, 0.3, 0.5, 0.7])
-    table = np.array(measure.binned([(doubt[:2], error[:2]), (doubt[2:], error[2:])]))
-    np.testing.assert_allclose(table[:, 0], [2, 0, 0, 0, 0, 1, 0, 0, 0, 1])
-    np.testing.assert_allclose(table[[0, 5, 9], 2], [0.4, 0.5, 0.7], rtol=1e-3)
-    assert measure.binned([]) is None
+    told, true = torch.tensor([1e-3, 0.05, 11.0, 1e3]), torch.tensor([0.1, 0.3, 0.5, 0.7])
+    pairs = [(told[:2], true[:2]), (told[2:], true[2:])]
+    table = np.array(measure.binned(pairs, (1.0, 1024.0)))
+    np.testing.assert_allclose(table[:, 0], [2, 0, 0, 1, 0, 0, 0, 0, 0, 1])
+    np.testing.assert_allclose(table[[0, 3, 9], 2], [0.4, 0.5, 0.7], rtol=1e-3)
+    assert measure.binned([], (1.0, 2.0)) is None
 
 
 def judged(**changed):
     one = {"half": "tuning", "metal": [1, 2], "false_metal": 0.25, "false_mirror": None}
     one |= {key: [False, False] for key in measure.DECISIONS}
-    one |= {"calibration": {"albedo": None, "roughness": [[4, 1, 2]] * 10}}
+    one |= {"calibration": {"albedo": None, "normal": None, "roughness": [[4, 1, 2]] * 10}}
     return one | changed
 
 
