@@ -1,7 +1,7 @@
 """Fit the weights of expected errors, `univoxel.evaluation.confidence.EXPECTED`, to training runs.
 
     univoxel lab bank --half tuning
-    python benchmarks/expected_errors.py BANK [--label draft] [--half tuning]
+    python benchmarks/expected_errors.py BANK [--label draft] [--half tuning] [--out FILE.json]
 
 BANK holds scenes/ and runs/. Prints the weights that fit all scenes, and how well those that are
 fitted to the other scenes foretell each one: rank correlation, mean error by tenths of the expected
@@ -11,15 +11,19 @@ one, and below which expected error nine of ten places are good.
 from __future__ import annotations
 
 import argparse
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from made import made
 from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
 from lab.bank.measure import HALVES
 from lab.bank.scenes import half_of
+from lab.record import result_text
 from univoxel.data import load_photos
 from univoxel.evaluation.confidence import EXPECTED, GOOD, POINTS, QUANTITIES, key_of, survey
 from univoxel.evaluation.measures import albedo_scales, errors_of, expected_view, render_layers
@@ -88,27 +92,58 @@ def foretold(w: np.ndarray, terms: np.ndarray) -> np.ndarray:
     return np.exp(w[0] + terms @ w[1:])
 
 
-def report(name: str, terms: list[np.ndarray], errors: list[np.ndarray]) -> None:
-    """Print the weights, and what those of the other scenes foretell of each."""
-    names = list(EXPECTED[name][1])
-    constant, *weights = fitted(terms, errors).round(2)
-    print(f"{name}: {constant}, {dict(zip(names, map(float, weights), strict=True))}")
+@dataclass(frozen=True)
+class Report:
+    """How well weights that were fitted to the other scenes foretell each scene."""
+
+    in_a_scene: float  # rank correlation, mean of the scenes
+    over_all: float  # rank correlation of all pixels
+    tenths: list[tuple[float, float]]  # mean expected and true error, by expected error
+    limit: float  # error that good places are below
+    good_below: float  # largest expected error up to which nine of ten places are
+    share: float  # of the pixels that are expected to be so good
+
+
+def report_of(name: str, terms: list[np.ndarray], errors: list[np.ndarray]) -> Report:
     told, ranks = [], []
     for k, own in enumerate(terms):
         others = [j for j in range(len(terms)) if j != k]
         told.append(foretold(fitted([terms[j] for j in others], [errors[j] for j in others]), own))
         ranks.append(spearman(torch.from_numpy(told[-1]), torch.from_numpy(errors[k])))
     p, y = np.concatenate(told), np.concatenate(errors)
-    pooled = spearman(torch.from_numpy(p), torch.from_numpy(y))
-    print(f"  rank correlation {np.mean(ranks):.2f} in a scene, {pooled:.2f} over all")
     order = np.argsort(p)
-    tenths = ((p[k].mean(), y[k].mean()) for k in np.array_split(order, 10))
-    print("  expected: true", *(f"{a:.3f}: {b:.3f}" for a, b in tenths))
-    limit = GOOD[name][1]
+    tenths = [(float(p[k].mean()), float(y[k].mean())) for k in np.array_split(order, 10)]
+    limit = GOOD[name][1] if name in GOOD else 0.2
     bad = np.cumsum(y[order] > limit) / np.arange(1, len(p) + 1)
     good = np.flatnonzero(bad <= 0.1)
-    least = p[order[good[-1]]] if len(good) else 0.0
-    print(f"  nine of ten below {limit:g} up to {least:.3f}, on {(p <= least).mean():.0%} of them")
+    below = float(p[order[good[-1]]]) if len(good) else 0.0
+    pooled = spearman(torch.from_numpy(p), torch.from_numpy(y))
+    share = float((p <= below).mean())
+    return Report(float(np.mean(ranks)), float(pooled), tenths, limit, below, share)
+
+
+def record_of(reports: dict[str, Report], label: str, half: str, count: int) -> dict[str, Any]:
+    """A table for the pages."""
+    ranks = (f"{n} {r.in_a_scene:.2f} and {r.over_all:.2f}" for n, r in reports.items())
+    digits = {"albedo": 3, "roughness": 2, "normal": 1}
+    units = {"albedo": "sRGB", "roughness": "0 to 1", "normal": "degrees"}
+    columns = [
+        {"name": f"{name}, {what}", "digits": digits[name]}
+        | ({"unit": units[name]} if units[name] else {})
+        for name in reports
+        for what in ("expected", "true")
+    ]
+    rows = [
+        [tenth + 1, *(x for report in reports.values() for x in report.tenths[tenth])]
+        for tenth in range(10)
+    ]
+    return {
+        "title": f"Expected and true errors by tenths of the pixels, {half} half, `{label}`",
+        **made(),
+        "note": f"{count} scenes. Rank correlation in a scene and over all: {'; '.join(ranks)}.",
+        "columns": [{"name": "tenth"}, *columns],
+        "rows": rows,
+    }
 
 
 def main() -> None:
@@ -117,6 +152,7 @@ def main() -> None:
     parser.add_argument("--label", default="draft", help="of the training runs")
     parser.add_argument("--half", choices=HALVES, default="tuning")
     parser.add_argument("--seed", type=int, default=0, help="of the bank")
+    parser.add_argument("--out", type=Path, help="a table for the pages")
     asked = parser.parse_args()
     found = []
     for scene in sorted((asked.bank / "scenes").iterdir()):
@@ -124,9 +160,16 @@ def main() -> None:
         if half_of(asked.seed, int(scene.name[-3:])) == asked.half and run.is_dir():
             found.append(collected(run, scene))
             print(scene.name, {k: round(float(v.mean()), 3) for k, v in found[-1][1].items()})
+    reports = {}
     for name, (_, weights) in EXPECTED.items():
         terms = [np.column_stack([t[key] for key in weights]).astype(float) for t, _ in found]
-        report(name, terms, [e[name].astype(float) for _, e in found])
+        errors = [e[name].astype(float) for _, e in found]
+        constant, *others = fitted(terms, errors).round(2)
+        print(f"{name}: {constant}, {dict(zip(weights, map(float, others), strict=True))}")
+        reports[name] = report_of(name, terms, errors)
+        print(f"  {reports[name]}")
+    if asked.out:
+        asked.out.write_text(result_text(record_of(reports, asked.label, asked.half, len(found))))
 
 
 if __name__ == "__main__":

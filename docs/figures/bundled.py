@@ -21,6 +21,7 @@ import numpy as np
 from PIL import Image
 
 from univoxel.data.images import read_exr
+from univoxel.evaluation.confidence import ALBEDO_LIMIT
 
 SCENE = Path(__file__).parents[2] / "univoxel/example_data/tiny"
 VIEW = 2  # of the test views: pepper and avocado side by side
@@ -96,8 +97,8 @@ def stage_frames(run: Path, out: Path) -> None:
     beside(columns).save(out / "stage_frames.png", optimize=True)
 
 
-def doubt(test: Path, out: Path) -> None:
-    """Render, albedo, doubt of the albedo and its true error, in one view."""
+def expected_error(test: Path, out: Path) -> None:
+    """Render, albedo, expected error of the albedo and its true error, in one view."""
     layers = read_exr(test / f"r_{VIEW:03d}.exr")
     albedo = np.stack([layers[f"albedo.{c}"] for c in "RGB"], -1)
     render = np.stack([layers[f"rgb.{c}"] for c in "RGB"], -1)
@@ -105,11 +106,9 @@ def doubt(test: Path, out: Path) -> None:
     inside = truth["alpha"] > 127
     scale = np.median(truth["albedo"][inside] / albedo[inside].clip(1e-3), 0)
     error = np.abs(encoded(albedo * scale) - encoded(truth["albedo"])).mean(-1) * inside
-    known = layers["doubt.albedo"]
-    low, high = np.quantile(known[inside], (0.02, 0.98))  # doubt is relative
-    shown = (known - low) / (high - low) * inside
-    pictures = [from_color(render), from_color(albedo), from_values(shown)]
-    beside([*pictures, from_values(error, 0.15)]).save(out / "doubt.png", optimize=True)
+    told = from_values(layers["expected_error.albedo"] * inside, ALBEDO_LIMIT)
+    pictures = [from_color(render), from_color(albedo), told, from_values(error, ALBEDO_LIMIT)]
+    beside(pictures).save(out / "expected_error.png", optimize=True)
 
 
 def point_light(run: Path, work: Path, out: Path) -> None:
@@ -136,7 +135,7 @@ def main() -> None:
         univoxel("envmap", str(run), "--out", str(work / "light.exr"))
         Image.open(work / "light.png").save(out / "envmap.png", optimize=True)
         univoxel("eval", str(run), "--save", str(work / "test"))
-        doubt(work / "test", out)
+        expected_error(work / "test", out)
         point_light(run, work, out)
 
 

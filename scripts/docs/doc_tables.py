@@ -236,7 +236,10 @@ def _lights(record: dict[str, Any], _: str) -> str:
 
 
 def _trust(record: dict[str, Any], _: str) -> str:
-    columns = (("albedo", "trust_spearman", 2), ("roughness", "trust_spearman_roughness", 2))
+    columns = (
+        *(("albedo", "trust_spearman", 2), ("roughness", "trust_spearman_roughness", 2)),
+        ("normals", "trust_spearman_normal", 2),
+    )
     runs = [((_scene(p["scene"]), f"`{p['setting']}`"), p["measures"]) for p in record["points"]]
     return measured(runs, ("scene", "preset"), columns)
 

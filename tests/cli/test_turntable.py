@@ -24,10 +24,17 @@ from univoxel.lights import EnvmapConfig
 from univoxel.lights.views import Table, Turntable, resampling, rotated
 from univoxel.preparation import light_frame
 from univoxel.preparation.hull import observe_hull
-from univoxel.preparation.light_frame import LightFrame, explained, light_frame_of
+from univoxel.preparation.light_frame import (
+    VARIED,
+    LightFrame,
+    explained,
+    light_frame_of,
+    varied_light,
+)
 from univoxel.render.observations import TurnedMaps, shade_observations, turned_maps
 from univoxel.render.pipeline import extract_mesh, radiance_of, shade
 from univoxel.scene import Scene, load_scene, save_scene
+from univoxel.sphere import random_rotation
 from univoxel.training import joint_solve
 from univoxel.training.equations import channel_radiance
 from univoxel.training.newton import linear_transport, newton_round_
@@ -78,6 +85,22 @@ def test_which_light_it_was(photographs, light, caplog):
         assert found.ahead > 3
         assert told == LightFrame(TURNTABLE)
         assert "light: it rotates with the camera, as on a turntable" in caplog.text
+
+
+def test_light_of_its_own_for_each_photograph_is_found():
+    """Lamps that are turned at random from photograph to photograph; exposures are no light."""
+    generator = torch.Generator().manual_seed(1)
+    turn = torch.stack([random_rotation(generator) for _ in range(VIEWS)])
+    maps = resampling(torch.nn.functional.normalize(sky_directions(), dim=1), turn) @ lamps(NODES)
+    differ, still = photographs_under(maps, 0.3, VIEWS), photographs_under(lamps(NODES), 0.3, VIEWS)
+    gains = torch.linspace(-0.5, 0.5, VIEWS)[torch.randperm(VIEWS, generator=generator)]
+    linear = srgb_to_linear(still.color.float() / 255) * (gains - 0.5).exp()[:, None, None, None]
+    exposed = replace(still, color=(255 * linear_to_srgb(linear)).round().to(torch.uint8))
+    assert varied_light(differ, *hull_of(differ), None) > 2 * VARIED
+    assert varied_light(still, *hull_of(still), None) < VARIED / 2
+    assert varied_light(exposed, *hull_of(exposed), gains) < VARIED / 2
+    black = replace(still, color=torch.zeros_like(still.color))
+    assert varied_light(black, *hull_of(black), None) == 0
 
 
 def test_exposures_are_no_light(photographs):

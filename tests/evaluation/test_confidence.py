@@ -11,7 +11,7 @@ from observed_points import RED, lamps, photographs_under
 from univoxel.data import Photos
 from univoxel.evaluation import confidence
 from univoxel.evaluation.confidence import (
-    QUANTITIES,
+    GOOD,
     UNSEEN,
     ExpectedErrors,
     numbers,
@@ -126,7 +126,7 @@ def test_each_term_counts_as_the_table_says(surveyed, monkeypatch):
     point = replace(
         surveyed,
         **{name: one for name in ("views", "visibility", "straight", "bumpiness", "variation")},
-        **{name: 0 * one for name in ("clipped", "gloss")},
+        **{name: 0 * one for name in ("clipped", "gloss", "recovered_roughness")},
         disagreement_nearby=0.01 * one,
         spread=8 * one,
     )
@@ -180,6 +180,7 @@ def test_expected_errors_are_those_of_the_nearest_on_the_same_side(surveyed):
     values = (
         *(("views", 9), ("straight", 9.0), ("visibility", 1.0), ("disagreement_nearby", 0.0)),
         *(("gloss", 1e3), ("bumpiness", 0.0), ("variation", 0.0), ("spread", 2), ("clipped", 0.0)),
+        ("recovered_roughness", 0.0),
     )
     same = {name: torch.full((400,), float(value)) for name, value in values}
     same["views"][200:] = 0
@@ -196,7 +197,7 @@ def test_words_leave_out_what_is_not_the_case(surveyed):
     figures = numbers(still)
     said = words(figures, [])
     assert said.startswith("Expected error, mean over the surface: 0.")
-    for name in QUANTITIES:
+    for name in GOOD:
         assert f"The {name} is good on {figures[f'{name}_good']:.0%} of the surface" in said
     assert "cameras" not in said
     assert "differs" not in said

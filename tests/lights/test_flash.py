@@ -182,6 +182,18 @@ def test_what_decides(photographs, monkeypatch, shade, glint, ahead, lit):
     assert (light_frame_of(photos, *hull_of(photos), "auto").flash is not None) == lit
 
 
+@pytest.mark.parametrize(("saved", "lit"), [(0.1, False), (0.2, True)])
+def test_a_flash_has_to_explain_more_than_a_turntable(photographs, monkeypatch, saved, lit):
+    """Either is ahead of a still light: both move with the camera."""
+    flashed = light_frame.Flashed(0.3, 0.0, 5.0, saved)
+    turned = light_frame.Explained(0.1, 0.4, 9.0, 0.3)
+    monkeypatch.setattr(light_frame, "explained_by_flash", lambda *_: flashed)
+    monkeypatch.setattr(light_frame, "explained", lambda *_: turned)
+    photos = photographs["room"]
+    told = light_frame_of(photos, *hull_of(photos), "auto")
+    assert (told.flash is not None, told.turntable is not None) == (lit, not lit)
+
+
 def test_nothing_seen_tells_nothing(photographs):
     photos = photographs["room"]
     seen = observe_hull(photos, *hull_of(photos), 100)

@@ -128,6 +128,9 @@ class LocalLightConfig(ABC):
     """What the configurations of all local lights have."""
 
     hidden: int  # width of the head, >= 1
+    layers: int  # hidden layers of the head, >= 0
+    directions: int  # in training, >= 1
+    directions_eval: int  # in evaluation, >= 1
     scale: float  # world units: half the extent of what is lit, > 0
 
 
@@ -139,6 +142,10 @@ class AbstractLocalLight(AbstractLight):
     config: LocalLightConfig
     head: MLP  # from `encode` of the surface
     base: nn.Parameter
+
+    @property
+    def directions(self) -> int:
+        return self.config.directions if self.training else self.config.directions_eval
 
 
 def build_head(

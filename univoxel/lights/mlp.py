@@ -2,31 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from univoxel import sphere
-from univoxel.core.records import Occlusion, Surface
 from univoxel.core.validation import check_settings, setting
-from univoxel.lights import base, quadrature
-from univoxel.lights.base import (
-    KIND,
-    MOST_DIRECTIONS,
-    MOST_LAYERS,
-    AbstractLocalLight,
-    LocalLightConfig,
-    Regularisation,
-    build_head,
-    encode,
-)
+from univoxel.lights.base import KIND, MOST_DIRECTIONS, MOST_LAYERS, LocalLightConfig
+from univoxel.lights.quadrature import START, BasisLight
 from univoxel.ops.networks import MLP, waves
-
-_MEAN_OVER = 32  # directions that stand for the whole sphere where light is averaged
-_START = 0.5  # radiance from everywhere
 
 
 @dataclass(frozen=True)
@@ -45,17 +30,14 @@ class MLPLightConfig(LocalLightConfig):
     __post_init__ = check_settings
 
 
-class LocalMLP(AbstractLocalLight):
+class LocalMLP(BasisLight):
     """Incident light as a network of features, position and direction, kept affordable.
 
-        L(x, w) = softplus(code(x) . basis(w))
-
-    One network reads the point and gives a code, the other reads the direction and gives as many
-    basis functions, the first of them constant. All points share the directions: N points under D
-    directions cost N + D runs of a network and one matrix product, where a single network of both,
-    as in NeILF, costs N D runs. What is lost is what a code of `rank` numbers a channel cannot say.
-    It holds direct light, indirect light and visibility together, and starts at radiance 1/2 from
-    everywhere.
+    One network reads the point and gives coefficients, the other reads the direction and gives as
+    many basis functions, the first of them constant. N points under D directions cost N + D runs of
+    a network and one matrix product, where a single network of both, as in NeILF, costs N D runs.
+    What is lost is what `rank` numbers a channel cannot say. It holds direct light, indirect light
+    and visibility together, and starts at radiance 1/2 from everywhere.
 
     Source: Yao et al. 2022 (NeILF) for light as a network of place and direction.
     """
@@ -73,49 +55,15 @@ class LocalMLP(AbstractLocalLight):
             features: C of Surface.features, >= 0.
             generator: draws the first weights.
         """
-        super().__init__()
-        self.config = config = config or MLPLightConfig()
-        outputs = 3 * (config.rank + 1)
-        self.head: MLP = build_head(features, config.hidden, config.layers, outputs, generator)
+        config = config or MLPLightConfig()
+        super().__init__(features, config, config.rank + 1, generator)
         sizes = [3 + 6 * config.frequencies, *[config.hidden] * config.layers, config.rank]
         self.basis_net: MLP = MLP(sizes, generator or torch.default_generator)
-        base = torch.zeros(config.rank + 1, 3)
-        base[0] = math.log(math.expm1(_START))
-        self.base: nn.Parameter = nn.Parameter(base)  # [rank + 1, 3]
-
-    @property
-    def directions(self) -> int:
-        return self.config.directions if self.training else self.config.directions_eval
-
-    def code(self, surface: Surface) -> Tensor:
-        """[N, rank + 1, 3] at each point."""
-        raw = self.head(encode(surface, self.config.scale))
-        return self.base + raw.unflatten(-1, (-1, 3))
+        with torch.no_grad():
+            self.base[0] = START
 
     def basis(self, wi: Tensor) -> Tensor:
         """[..., rank + 1] of unit directions [..., 3]; the first is 1."""
         encoded = torch.cat([wi, *waves(wi, self.config.frequencies)], -1)
         values = self.basis_net(encoded.flatten(0, -2)).unflatten(0, wi.shape[:-1])
         return torch.cat([torch.ones_like(values[..., :1]), values], -1)
-
-    def incident(self, surface: Surface, wi: Tensor) -> Tensor:
-        """Radiance [N, D, 3] from unit directions wi [N, D, 3]; or [D, 3], the same for all."""
-        return nn.functional.softplus(self.basis(wi) @ self.code(surface))
-
-    def reflected(
-        self,
-        surface: Surface,
-        wo: Tensor,
-        occlusion: Occlusion | None = None,
-        generator: torch.Generator | None = None,
-    ) -> Tensor:
-        """Radiance [N, 3] towards wo, summed over the whole sphere."""
-        return quadrature.reflected_shared(self, surface, wo, occlusion, generator)
-
-    def regularisation(self, surface: Surface, near: Surface) -> Regularisation:
-        here, beside = self.code(surface), self.code(near)
-        wi = sphere.fibonacci_sphere(_MEAN_OVER).to(here)
-        light = nn.functional.softplus(self.basis(wi) @ here)
-        return Regularisation(
-            light_smoothness=base.smoothness(here, beside), white_light=base.chroma(light.mean(1))
-        )

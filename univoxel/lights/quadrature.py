@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from univoxel import brdf, ops, sphere
 from univoxel.core.records import Occlusion, Surface
-from univoxel.lights.base import AbstractLight
+from univoxel.lights import base
+from univoxel.lights.base import (
+    AbstractLight,
+    AbstractLocalLight,
+    LocalLightConfig,
+    Regularisation,
+)
 
 
 def rotations(
@@ -133,3 +140,69 @@ def reflected_shared(
         4 * math.pi / len(directions),
         f0,
     )
+
+
+_MEAN_OVER = 32  # directions that stand for the whole sphere where light is averaged
+START = math.log(math.expm1(0.5))  # softplus makes radiance 1/2 of it
+
+
+class BasisLight(AbstractLocalLight):
+    """Local light as functions of the direction, weighted by coefficients at each point.
+
+        L(x, w) = softplus(coefficients(x) . basis(w))
+
+    All points share the directions, so the basis is evaluated once a direction, and a matrix
+    product does the rest. A bare sum swings below zero beside every lamp. Clamped there, it would
+    get no gradient and stay dark; softplus is positive, follows the sum where light is bright, and
+    lets a dark direction come back.
+    """
+
+    def __init__(
+        self,
+        features: int,
+        config: LocalLightConfig,
+        count: int,
+        generator: torch.Generator | None,
+    ) -> None:
+        """
+        Args:
+            features: C of Surface.features, >= 0.
+            count: of the basis, B.
+            generator: draws the first weights.
+        """
+        super().__init__()
+        self.config = config
+        outputs = 3 * count
+        self.head = base.build_head(features, config.hidden, config.layers, outputs, generator)
+        self.base = nn.Parameter(torch.zeros(count, 3))
+
+    @abstractmethod
+    def basis(self, wi: Tensor) -> Tensor:
+        """[..., B] of unit directions [..., 3]."""
+
+    def coefficients(self, surface: Surface) -> Tensor:
+        """[N, B, 3] at each point."""
+        raw = self.head(base.encode(surface, self.config.scale))
+        return self.base + raw.unflatten(-1, (-1, 3))
+
+    def incident(self, surface: Surface, wi: Tensor) -> Tensor:
+        """Radiance [N, D, 3] from unit directions wi [N, D, 3]; or [D, 3], the same for all."""
+        return nn.functional.softplus(self.basis(wi) @ self.coefficients(surface))
+
+    def reflected(
+        self,
+        surface: Surface,
+        wo: Tensor,
+        occlusion: Occlusion | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Radiance [N, 3] towards wo, summed over the whole sphere."""
+        return reflected_shared(self, surface, wo, occlusion, generator)
+
+    def regularisation(self, surface: Surface, near: Surface) -> Regularisation:
+        here, beside = self.coefficients(surface), self.coefficients(near)
+        wi = sphere.fibonacci_sphere(_MEAN_OVER).to(here)
+        light = nn.functional.softplus(self.basis(wi) @ here)
+        return Regularisation(
+            light_smoothness=base.smoothness(here, beside), white_light=base.chroma(light.mean(1))
+        )

@@ -108,10 +108,6 @@ class LocalSG(AbstractLocalLight):
             white_light(config.lobes, config.max_sharpness)
         )  # [K, 7]
 
-    @property
-    def directions(self) -> int:
-        return self.config.directions if self.training else self.config.directions_eval
-
     def raw(self, surface: Surface) -> Tensor:
         """What the head adds to the global light at each point: [N, 7 K]."""
         return self.head(encode(surface, self.config.scale))

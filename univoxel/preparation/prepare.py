@@ -17,10 +17,17 @@ from univoxel.core.choices import Varying
 from univoxel.data import Photos
 from univoxel.errors import DataError, UserError
 from univoxel.fields.grid import GridShape, fit_grid
+from univoxel.lights.base import LocalLightConfig
 from univoxel.preparation.carving import carve_within_time
 from univoxel.preparation.hull import observe_hull, visual_hull
 from univoxel.preparation.hull_constraint import PinnedHull, pinned_hull
-from univoxel.preparation.light_frame import LightFrame, light_frame_of, say_strays
+from univoxel.preparation.light_frame import (
+    VARIED,
+    LightFrame,
+    light_frame_of,
+    say_strays,
+    varied_light,
+)
 from univoxel.preparation.masks import fitted_masks
 from univoxel.preparation.object_shape import ObjectShape, signed_distance
 from univoxel.preparation.pose_refinement import (
@@ -306,6 +313,16 @@ def prepare(
     say_clipped(photos)
     varying, gains = varying_and_gains(photos, hull, grid, cfg.scene.varying, cfg.exposures)
     frame = light_frame_of(photos, hull, grid, cfg.light_frame, gains)
+    if cfg.exposures and frame == LightFrame() and isinstance(cfg.scene.light, LocalLightConfig):
+        saved = varied_light(photos, hull, grid, gains)
+        if saved > VARIED:
+            varying = "light"
+            log.info(
+                "light differs between photographs, so each gets its own, which explains %.0f %% "
+                "more of the colour changes than exposures do; varying=none switches this off",
+                100 * saved,
+                extra={"arguments": ("varying",)},
+            )
     pinned, in_world = None, frame == LightFrame()
     if varying == "none" and in_world and begins(PINNED):
         pinned = find_pinned(silhouettes, photos.cameras, hull, grid)
