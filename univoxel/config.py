@@ -180,7 +180,7 @@ class TrainConfig:
         "auto", "refined: optimise camera poses; auto: only if silhouettes are inconsistent"
     )
     exposures: bool = setting(
-        True, "whether to look for differing exposures; if found, scene.varying becomes exposure"
+        True, "whether to look for differing exposures and light; the result sets scene.varying"
     )
     allow_outside: bool = setting(
         False, "also read files outside the folder if the data set refers to them"

@@ -80,7 +80,7 @@ def budget(
             traced visibility from the beginning; "baked", no light: the colours of the photographs
             are used as albedo. docs/guide/lights.md compares them.
         varying: what changes between photographs: "none"; "exposure", a gain per channel; "light",
-            the light as well; "auto", exposure if it is seen to change.
+            the light as well; "auto", what is seen to change.
 
     Raises:
         UserError: minutes is out of range, there is no such light, or the light varies and is one

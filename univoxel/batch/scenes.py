@@ -183,7 +183,7 @@ def write_sheet(results: Sequence[SceneResult], out: Path) -> Path:
     """Write out/index.html, which holds its pictures; return it. Failed scenes come first."""
     shown = [key for key in COLUMNS if any(r.measures.get(key) is not None for r in results)]
     heads = ["", "scene", "verdict", *(COLUMNS[key][0] for key in shown)]
-    heads += ["expected albedo error", "of roughness", "of normals", "training", "all", ""]
+    heads += ["albedo error", "roughness error", "normal error", "training", "all", ""]
     ordered = sorted(results, key=lambda r: (WORSE_FIRST[r.state], r.name))
     counts = [(state, sum(r.state == state for r in results)) for state in WORSE_FIRST]
     about = ", ".join(f"{count} {state}" for state, count in counts if count)

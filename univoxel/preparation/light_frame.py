@@ -1,7 +1,5 @@
-"""The frame that the light is fixed to: the world, the room of a turntable, or the camera.
-
-Of a turntable also a background that stood still, and cameras off the circle of the others.
-"""
+"""The frame that the light is fixed to: the world, the room of a turntable, or the camera; and
+whether it differs from photograph to photograph."""
 
 from __future__ import annotations
 
@@ -12,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
-from univoxel.camera import Circle, circle_of, looked_at
+from univoxel.camera import looked_at
 from univoxel.color import CLIPPED, linear_to_srgb
 from univoxel.core import log
 from univoxel.core.choices import LightFrameOrAuto
@@ -101,53 +99,6 @@ def _correlation(
     a, b = a - a.mean(), b - b.mean()
     size = float(a.norm() * b.norm())
     return float(a @ b) / size if size > 1e-3 * len(a) else None
-
-
-# Photographs of a turntable whose cameras do not stand on the circle of the others.
-#
-# Structure from motion that finds too few matches somewhere continues from there a few degrees off.
-# Silhouettes and matches of pairs hardly show it: along the circle a round object looks alike, and
-# what is matched moves along the lines that it is held against.
-
-
-NAMED = 8  # photographs that the message names, at most
-
-
-def find_strays(photos: Photos) -> Circle | None:
-    """The circle of a turntable with photographs that were placed off it; None: none were.
-
-    Only before surroundings that stood still is it known to be a circle: who walks around an object
-    may well step aside.
-    """
-    circle = circle_of(photos.cameras)
-    if circle is None or not circle.strays().any() or not surroundings_stand_still(photos):
-        return None
-    return circle
-
-
-def say_strays(photos: Photos) -> None:
-    """Warn of photographs that were placed off the circle of their turntable, and name them.
-
-    They are trained on all the same: of what they alone show, wrong views are better than none.
-    """
-    circle = find_strays(photos)
-    if circle is None:
-        return
-    strays = circle.strays()
-    found = strays.nonzero()[:, 0].tolist()
-    names = ", ".join(photos.names[view] for view in found[:NAMED])
-    log.warning(
-        "%d of %d camera poses are up to %.1f degrees off the circle around the turntable (median "
-        "of the others: %.1f). Surfaces that only %s%s show will not fit. To find all poses "
-        "again, run `univoxel poses` with the photographs' masks; see also cameras",
-        len(found),
-        len(photos),
-        math.degrees(float(circle.off[strays].max())),
-        math.degrees(float(circle.off[~strays].median())),
-        names,
-        ", .." if len(found) > NAMED else "",
-        extra={"arguments": ("cameras",)},
-    )
 
 
 # Whether the light stood still around the object, or turned about it with the camera.

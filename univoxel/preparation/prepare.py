@@ -25,7 +25,6 @@ from univoxel.preparation.light_frame import (
     VARIED,
     LightFrame,
     light_frame_of,
-    say_strays,
     varied_light,
 )
 from univoxel.preparation.masks import fitted_masks
@@ -264,8 +263,6 @@ def find_silhouettes(
     Raises:
         DataError: the silhouettes share no volume.
     """
-    if cfg.cameras == "auto":
-        say_strays(photos)
     given = photos
     in_time = begins("masks")
     photos, distance = fitted_masks(given, cfg.masks if in_time else "given")
