@@ -62,7 +62,7 @@ def photos():
 def test_cameras_off_the_circle_are_named(photos, caplog):
     say_strays(astray(photos))
     assert "3 of 16 camera poses are up to 1.8 degrees off the circle" in caplog.text
-    assert "(the others: 0.0 in the median)" in caplog.text
+    assert "(median of the others: 0.0)" in caplog.text
     assert "Surfaces that only p_13, p_14, p_15 show will not fit" in caplog.text
 
 
