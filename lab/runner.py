@@ -86,7 +86,7 @@ def _run(jobs: Sequence[Job], at_once: int, scheduler: str | None) -> list[Outco
         if found is not None and found.identity != job.identity["training"]:
             raise UserError(
                 f"{job.files.parent / RESULT}: comes from another configuration or data set: "
-                "remove it, or choose another out",
+                "remove it, or choose another folder for out",
                 "out",
             )
         if found is not None and not found.error:

@@ -80,7 +80,7 @@ def submit(
         )
     run, out = Path(run), Path(out)
     if out.exists():
-        raise ExistingFile(f"{out} exists already: choose another out", "out")
+        raise ExistingFile(f"{out} exists already: choose another folder for out", "out")
     photos = photos_of(run)
     folder, truth = scene_folders(photos.folder)
     scene, near = load_scene(run), albedo_near(run)

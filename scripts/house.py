@@ -19,7 +19,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 from layers import LAYERS, violations  # noqa: E402
 
 LIMITS = {
-    "lines of the package": 38_252,
+    "lines of the package": 38_330,
     "lines of the laboratory": 5_300,
     "lines of tests": 37_620,
     "modules of the package": 165,

@@ -84,7 +84,7 @@ def test_every_field_is_explained():
         (TRAIN, {"out": None}, "out must be a path, got None"),
         (TRAIN, {"out": Path("run\udcff")}, "out must be a path in UTF-8, got .*run.udcff"),
         (TRAIN, {"stages": ()}, r"stages must be a tuple whose first stage .*got \(\)"),
-        (TRAIN, {"stages": (JointConfig(),)}, "stages must be a StageConfig first"),
+        (TRAIN, {"stages": (JointConfig(),)}, "stages must be a tuple whose first"),
         (TRAIN, {"stages": (STAGE, JointConfig()), "scene": NO_SKY}, "scene.sky_nodes above 0"),
         (TRAIN, {"masks": "wide"}, "masks must be auto or given, got 'wide'"),
         (TRAIN, {"cameras": "wrong"}, "cameras must be auto, given or refined, got 'wrong'"),

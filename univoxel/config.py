@@ -276,7 +276,7 @@ def load_config(path: Path) -> TrainConfig:
         ConfigError: it holds something else; the message names file and field.
     """
     if not path.is_file():
-        raise MissingFile(f"{path}: expected the config.json of a run, but there is no such file")
+        raise MissingFile(f"{path}: expected a configuration, such as the config.json of a run")
     values = read_json(path)
     try:
         if not isinstance(values, dict):

@@ -128,7 +128,8 @@ def holds(identity: str, folder: Path) -> bool:
         return False
     if path.read_text(encoding="utf-8") != identity:
         raise UserError(
-            f"{path}: made for another scene: remove {folder}, or choose another out", "out"
+            f"{path}: made for another scene: remove {folder}, or choose another folder for out",
+            "out",
         )
     return True
 

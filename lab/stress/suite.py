@@ -181,7 +181,9 @@ def _damaged(
     path = place / IDENTITY
     if path.exists():
         if path.read_text(encoding="utf-8") != identity:
-            raise UserError(f"{path}: made from other photographs: choose another out", "out")
+            raise UserError(
+                f"{path}: made from other photographs: choose another folder for out", "out"
+            )
         return place
     damaged(scene, place, damage, seed, second)
     path.write_text(identity, encoding="utf-8")

@@ -23,8 +23,13 @@ def tile(name, agreement, fault="", value=0.5, after=None):
 
 
 def test_the_worst_come_first():
-    tiles = [tile("b", 0.9), tile("a", 0.9), tile("c", 0.95), tile("d", 0.91, "misses a part")]
-    tiles += [tile("e", 0.2, "keeps something beside the object"), tile("f", 0.1)]
+    tiles = [
+        tile("b", 0.9),
+        tile("a", 0.9),
+        tile("c", 0.95),
+        tile("d", 0.91, "misses part of the object"),
+    ]
+    tiles += [tile("e", 0.2, "includes more than the object"), tile("f", 0.1)]
     assert [t.name for t in worst_first(tiles)] == ["e", "d", "f", "a", "b", "c"]
     unvoted = [tile("b", None), tile("a", None)]
     assert [t.name for t in worst_first(unvoted)] == ["a", "b"]
@@ -41,7 +46,7 @@ def test_photographs_are_dark_outside_of_the_mask():
 
 
 def test_before_and_after_lie_beside_each_other():
-    mended = tile("a", 0.5, "misses a part", 0.2, torch.full((TILE, TILE, 3), 0.8))
+    mended = tile("a", 0.5, "misses part of the object", 0.2, torch.full((TILE, TILE, 3), 0.8))
     sheet = mask_sheet([mended, *(tile(str(k), 0.9) for k in range(COLUMNS - 1))])
     assert sheet.shape == (2 * (TILE + LABEL + GAP), COLUMNS * (TILE + GAP), 3)
     row = sheet[LABEL + TILE // 2].astype(int)
@@ -52,7 +57,7 @@ def test_before_and_after_lie_beside_each_other():
 
 
 def test_the_page_needs_no_other_file(tmp_path):
-    mended = tile("<a>", 0.5, "misses a part", 0.2, torch.full((TILE, TILE, 3), 0.8))
+    mended = tile("<a>", 0.5, "misses part of the object", 0.2, torch.full((TILE, TILE, 3), 0.8))
     write_page(tmp_path / "masks.html", [mended, tile("b", None)], "1 & 2")
     text = (tmp_path / "masks.html").read_text()
     assert text.count("data:image/jpeg;base64,") == 3

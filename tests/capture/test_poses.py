@@ -185,7 +185,7 @@ def test_the_same_again_is_done_and_other_settings_are_refused(scene, photograph
     before = (out / "poses.json").stat().st_mtime_ns
     assert poses(photographs, out, config=SMALL) == out
     assert (out / "poses.json").stat().st_mtime_ns == before
-    with pytest.raises(ExistingFile, match="holds another scene"):
+    with pytest.raises(ExistingFile, match="contains another scene"):
         poses(photographs, out)
 
 
@@ -231,7 +231,7 @@ def test_a_search_of_version_0_2_is_gone_on_with(scene, photographs, tmp_path, m
     poses(photographs, before, config=SMALL)
     assert ran == []
     assert (before / "sparse/0/images.bin").stat().st_mtime_ns == images
-    with pytest.raises(ExistingFile, match="holds another scene"):
+    with pytest.raises(ExistingFile, match="contains another scene"):
         poses(photographs, before)
     poses(photographs, begun, config=SMALL)
     assert ran == ["map"]

@@ -138,7 +138,7 @@ def test_masks_that_are_mostly_wrong_stay(tmp_path, with_masks, caplog):
     task.cutout(data, out, folder)
     said = [r for r in caplog.records if r.levelno == logging.WARNING]
     assert len(said) == 1
-    assert "none is corrected" in said[0].getMessage()
+    assert "no mask is corrected" in said[0].getMessage()
     assert "check masks.html" in said[0].getMessage()
     cut = load_photos(out)
     for view, mask in enumerate(masks):

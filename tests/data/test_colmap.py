@@ -141,7 +141,7 @@ def test_models_that_are_not_supported(tmp_path, number, name):
     write_colmap(tmp_path, scene())
     data = struct.pack("<Q", 1) + struct.pack("<iiQQ", 3, number, WIDTH, HEIGHT) + bytes(80)
     (tmp_path / "sparse" / "0" / "cameras.bin").write_bytes(data)
-    with pytest.raises(DataError, match=f"camera 3 is {name}: run colmap image_undistorter"):
+    with pytest.raises(DataError, match=f"got {name} for camera 3: run colmap"):
         load_photos(tmp_path)
 
 

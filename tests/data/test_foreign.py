@@ -290,7 +290,7 @@ def two_fit(folder):
                 f, s, "sparse/0", True, "FULL_OPENCV", (*[9] * 4, *[0.1] * 8)
             ),
             lambda f: None,
-            "camera 3 is FULL_OPENCV with k4, k5 or k6: run",
+            "got FULL_OPENCV with k4, k5 or k6 for camera 3: run",
         ),
     ],
 )

@@ -126,7 +126,7 @@ def test_names_come_before_pictures(data, tmp_path, monkeypatch, layout):
         data = write_colmap(tmp_path / "colmap", scene(), text=True)
         path = data / "sparse/0/images.txt"
         path.write_text(path.read_text().replace("p_003.png", "p_004.png"))
-        message = r"images\.txt: expected unique names of photographs, got another 'p_004\.png'"
+        message = r"images\.txt: expected unique, non-empty names of images, got 'p_004\.png'"
     with pytest.raises(DataError, match=message):
         load_photos(data)
 

@@ -56,7 +56,7 @@ class BatchOptions:
     tries: Annotated[int, parsing.ADVANCED] = 3
     """number of attempts at a scene whose process is killed"""
     json: parsing.JsonFile = None
-    """also write the contents of batch.json to a file; - prints them in place of the table"""
+    """also write the content of batch.json to a file; - prints it, not the table"""
 
     def training(self) -> TrainConfig:
         """The configuration of a training; a UserError if there is none of that kind."""

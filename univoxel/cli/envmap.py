@@ -32,10 +32,10 @@ def command(asked: EnvmapOptions) -> None:
     found = envmap(**vars(asked))
     print(asked.out)
     if found:
-        print("Comparison with the true map:")
-        print(f"diffuse sphere under the map: PSNR {found.ball_psnr:.1f} dB, scaled per channel")
-        print(f"chrome sphere under the map: PSNR {found.mirror_psnr:.1f} dB")
-        print(f"distance of the brightest directions: {found.brightest_degrees:.1f} degrees")
+        under = "under this map and the true one: PSNR"
+        print(f"diffuse sphere {under} {found.ball_psnr:.1f} dB, scaled per channel")
+        print(f"chrome sphere {under} {found.mirror_psnr:.1f} dB")
+        print(f"brightest directions of both maps: {found.brightest_degrees:.1f} degrees apart")
 
 
 @takes(EnvmapOptions)

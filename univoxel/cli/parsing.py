@@ -134,7 +134,7 @@ def parse(
     if name not in commands:
         near = difflib.get_close_matches(name, commands, n=1)
         perhaps = f"; perhaps you meant {near[0]}" if near else ""
-        raise Usage(f"there is no command {name!r}{perhaps}; see univoxel {prefix}--help")
+        raise Usage(f"no command {name!r}{perhaps}; see univoxel {prefix}--help")
     program, said = f"univoxel {prefix}{name}", io.StringIO()
     if {"-h", "--help"} & set(rest):
         print(help_of(program, commands[name]))

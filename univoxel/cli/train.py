@@ -36,7 +36,7 @@ class TrainOptions:
     light_frame: Annotated[choices.LightFrameOrAuto, parsing.ADVANCED] = "auto"
     """world: the light is fixed; turntable: it moves with the camera; camera: a flash"""
     metal: Annotated[choices.Metal, parsing.ADVANCED] = "auto"
-    """all: the object is entirely metal (even with patina); some: it is not; auto: detect"""
+    """all: the object is all metal, even with patina; some: it is not; auto: detect"""
     detail: choices.DetailingOrAuto = "auto"
     """texture: refine the albedo from full-size photographs; auto: except with draft"""
     masks: choices.MasksFrom = "auto"
