@@ -235,15 +235,6 @@ def _lights(record: dict[str, Any], _: str) -> str:
     return table(heads, grouped(rows), [False] * 2 + [True] * len(columns))
 
 
-def _trust(record: dict[str, Any], _: str) -> str:
-    columns = (
-        *(("albedo", "trust_spearman", 2), ("roughness", "trust_spearman_roughness", 2)),
-        ("normals", "trust_spearman_normal", 2),
-    )
-    runs = [((_scene(p["scene"]), f"`{p['setting']}`"), p["measures"]) for p in record["points"]]
-    return measured(runs, ("scene", "preset"), columns)
-
-
 def _demo(record: dict[str, Any], _: str) -> str:
     """What `univoxel eval --json` wrote of the demo."""
     shown = record | {"mb": record["model_bytes"] / 1e6}
@@ -526,7 +517,6 @@ KINDS: dict[str, Callable[[dict[str, Any], str], str]] = {
     "chart.json": _chart,
     "chart.json:small": _chart,
     "chart.json:seeds": _chart,
-    "chart.json:trust": _trust,
     "chart.json:published": _published,
     "demo.json": _demo,
     "lights.json": _lights,

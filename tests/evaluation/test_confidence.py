@@ -198,7 +198,7 @@ def test_words_leave_out_what_is_not_the_case(surveyed):
     said = words(figures, [])
     assert said.startswith("Expected error, mean over the surface: 0.")
     for name in GOOD:
-        assert f"The {name} is good on {figures[f'{name}_good']:.0%} of the surface" in said
+        assert f"{figures[f'{name}_good']:.0%} of the surface has a good {name}" in said
     assert "cameras" not in said
     assert "differs" not in said
     assert "Photographs cannot separate the brightness" in said

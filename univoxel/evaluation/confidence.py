@@ -395,8 +395,8 @@ def words(figures: dict[str, float], troubles: list[str]) -> str:
         f"sRGB), {figures['roughness_error']:.2f} for the roughness, {figures['normal_error']:.0f} "
         "degrees for the normals.",
         *(
-            f"The {name} is good on {figures[f'{name}_good']:.0%} of the surface: on rendered "
-            f"scenes, nine of ten such places have an error below {limit:g}{UNITS[name]}."
+            f"{figures[f'{name}_good']:.0%} of the surface has a good {name}: on rendered scenes, "
+            f"nine of ten such places have an error below {limit:g}{UNITS[name]}."
             for name, (_, limit) in GOOD.items()
         ),
     ]
