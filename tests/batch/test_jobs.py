@@ -291,7 +291,7 @@ def test_a_worker_without_the_package_is_named(tmp_path):
 
     with connect(1) as client, pytest.MonkeyPatch.context() as patch:
         patch.setattr("univoxel.batch.jobs.run_on_worker", run_on_worker)
-        with pytest.raises(ProcessFailed, match="a worker has no univoxel or another version"):
+        with pytest.raises(ProcessFailed, match="a worker has another version of univoxel"):
             list(run_jobs(client, [counting(tmp_path, "mug")], 1))
 
 

@@ -69,7 +69,7 @@ def test_truth_that_is_not_there(tmp_path):
     [
         ({"alpha": None}, r"expected an array alpha \[H, W\], got albedo \[4, 6, 3\]"),
         ({"alpha": np.zeros(3, np.uint8)}, r"expected an array alpha \[H, W\]"),
-        ({"albedo": np.zeros((HEIGHT, WIDTH))}, r"expected finite albedo of shape \[4, 6, 3\],"),
+        ({"albedo": np.zeros((HEIGHT, WIDTH))}, r"expected albedo of \[4, 6, 3\], got"),
         ({"roughness": np.full((HEIGHT, WIDTH), np.nan)}, "expected finite roughness"),
         ({"albedo": np.array([object()])}, "this npz file could not be read: .*pickle"),
     ],

@@ -323,7 +323,7 @@ def _result(future: Any, job: Job) -> Result:
         return future.result()
     if isinstance(error, KilledWorker):
         return Result(job.name, "failed", {"worker": "every worker that took this scene died"})
-    raise ProcessFailed(f"a worker has no univoxel or another version of it: {error}") from error
+    raise ProcessFailed(f"a worker has another version of univoxel, or none: {error}") from error
 
 
 class ProgressTable:

@@ -359,7 +359,7 @@ def _to_jpeg(video: Path, folder: Path) -> str:
         _write_table(folder / TABLE, stated, curve)
         table = f",lut3d=file={TABLE}:interp=tetrahedral"
     if curve in HDR:
-        said = "%s: %s colours (HDR) were tone mapped, which clips all that is brighter than white"
+        said = "%s: %s colours (HDR) were tone mapped; detail brighter than white is mostly lost"
         log.warning(said, video.name, HDR[curve])
     exact = "flags=bicubic+accurate_rnd+full_chroma_int"
     return (

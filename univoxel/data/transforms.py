@@ -67,7 +67,7 @@ def load_cameras(
     """
     path = Path(path)
     if not path.is_file():
-        raise DataError(f"{path}: expected a camera file, but it does not exist")
+        raise DataError(f"{path}: expected a camera file, but there is no such file")
     root, frames = read_transforms(path)
     names = view_names([str(f.get("file_path", f"{i:04d}")) for i, f in enumerate(frames)])
     for index, name in enumerate(names):
