@@ -608,6 +608,41 @@ def test_a_container_of_few_cores_gets_few_threads(granted, asked, threads, monk
         torch.set_num_threads(before)
 
 
+@pytest.mark.parametrize(("asked", "cores", "threads"), [(1, 8, 1), (8, 8, 8), (10**9, 2, 2)])
+def test_more_threads_than_cores_are_not_started(asked, cores, threads, monkeypatch):
+    import torch
+
+    monkeypatch.setattr("univoxel.core.system.usable_cores", lambda: cores)
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    before = torch.get_num_threads()
+    try:
+        take_threads(asked)
+        assert os.environ["OMP_NUM_THREADS"] == str(threads)
+        assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("asked", ["0", "-1", "few"])
+def test_threads_that_are_no_number_of_threads(capsys, calls, asked):
+    assert main(["info", "run", "--threads", asked]) == 2
+    assert "--threads" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="a call of Linux")
+def test_threads_of_a_process_that_may_use_one_core():
+    """As taskset and `docker --cpuset-cpus` leave it."""
+    code = (
+        "import os, sys\nos.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
+        "from univoxel.cli import main\nsys.exit(main(['doctor', '--json', '-']))"
+    )
+    env = {name: text for name, text in os.environ.items() if name != "OMP_NUM_THREADS"}
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env)
+    assert run.returncode == 0, run.stderr
+    found = {one["what"]: one["found"] for one in json.loads(run.stdout)}
+    assert found["threads"] == "1 on 1 cores"
+
+
 def test_threads_are_known_before_torch_is_imported():
     code = (
         "import sys\nfrom univoxel.cli import main\n"

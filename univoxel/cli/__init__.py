@@ -231,9 +231,12 @@ def take_threads(threads: int | None) -> None:
     """Set the number of threads of kernels, torch and child processes.
 
     None: OMP_NUM_THREADS, or else one per core. If a control group grants fewer cores, as in a
-    container, OpenMP does not see it, and the surplus threads would wait.
+    container, OpenMP does not see it, and the surplus threads would wait. So would those of a
+    number beyond the cores, of which torch leaves out the surplus only where it has MKL.
     """
-    if threads is None:
+    if threads is not None:
+        threads = min(threads, system.usable_cores())
+    else:
         granted = machine.cores()
         if "OMP_NUM_THREADS" in os.environ or granted >= system.usable_cores():
             return
