@@ -623,6 +623,22 @@ def test_more_threads_than_cores_are_not_started(asked, cores, threads, monkeypa
         torch.set_num_threads(before)
 
 
+def test_threads_of_a_batch_may_be_of_larger_machines(calls, monkeypatch):
+    """As examples/slurm_batch.py asks for, on a node that only submits."""
+    import torch
+
+    monkeypatch.setattr("univoxel.core.system.usable_cores", lambda: 1)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    asked = {}
+    calls.give("univoxel.cli.batch", batch=lambda _, threads: asked.update(threads=threads) or [])
+    before = torch.get_num_threads()
+    try:
+        main(["batch", "scenes", "--out", "night", "--threads", "16"])
+        assert asked == {"threads": 16}
+    finally:
+        torch.set_num_threads(before)
+
+
 @pytest.mark.parametrize("asked", ["0", "-1", "few"])
 def test_threads_that_are_no_number_of_threads(capsys, calls, asked):
     assert main(["info", "run", "--threads", asked]) == 2
