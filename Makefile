@@ -6,7 +6,7 @@ SETUP := .venv/.installed
 CXX_SOURCES := CMakeLists.txt $(wildcard cmake/*.cmake csrc/*.* csrc/*/* third_party/*/*)
 # Tests run beside one another: a thread that waits should leave its core to them. Alone, a training
 # is faster as the command line has it.
-test page-test network-test fuzz kill-test asan tsan wheel-test: export OMP_WAIT_POLICY ?= passive
+test page-test network-test fuzz kill-test asan tsan wheel-test pythons: export OMP_WAIT_POLICY ?= passive
 # Where torch.compile finds Python's headers when they had to be unpacked there.
 DEPS := $(CURDIR)/.deps/usr/include
 export CPLUS_INCLUDE_PATH := $(DEPS):$(DEPS)/python$(addprefix :,$(CPLUS_INCLUDE_PATH))
@@ -15,7 +15,7 @@ export CPLUS_INCLUDE_PATH := $(DEPS):$(DEPS)/python$(addprefix :,$(CPLUS_INCLUDE
 # that a test ends is begun anew, once: the same test is tried again, and would end each.
 TWO := -n 2 --dist loadfile --max-worker-restart 1
 
-.PHONY: help dev demo test net page-test network-test fuzz kill-test lint format bench profile docs docs-check docs-write asan tsan audit wheel wheel-test index-test arm-test cross clean
+.PHONY: help dev demo test net page-test network-test fuzz kill-test lint format bench profile docs docs-check docs-write asan tsan audit wheel wheel-test pythons index-test arm-test cross clean
 .DELETE_ON_ERROR:
 
 help:
@@ -37,6 +37,7 @@ help:
 	@echo "make audit   ask the package index for known holes of what is installed; needs its network"
 	@echo "make wheel   source distribution and wheels of each Python that is here, into dist/"
 	@echo "make wheel-test  install a wheel where there is nothing else, run demo and ops' tests"
+	@echo "make pythons  wheel and wheel-test of each CPython from 3.10 to 3.14; fetches those of Debian; root"
 	@echo "make index-test  pip install univoxel[capture,masks,view] from dist/ as an index"
 	@echo "make arm-test  compile for 64-bit ARM, run tests and demo in emulation; root; hours"
 	@echo "make cross   compile and link for macOS on ARM and for Windows; root; half an hour"
@@ -191,6 +192,10 @@ wheel: .venv/.wheel
 
 wheel-test: wheel
 	scripts/test_wheel.sh dist/univoxel-*-$$($(PYTHON) -c 'import sys; print("cp%d%d" % sys.version_info[:2])')-*.whl $(PYTHON)
+
+# VERSIONS="3.12 3.14" chooses
+pythons: .venv/.wheel
+	scripts/pythons.sh $(VERSIONS)
 
 index-test:
 	scripts/index_test.sh $(PYTHON)

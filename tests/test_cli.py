@@ -586,11 +586,23 @@ def test_threads(calls, monkeypatch):
         torch.set_num_threads(before)
 
 
+@pytest.fixture
+def torch_threads():
+    """How many threads torch has; it has them again after the test."""
+    import torch
+
+    before = torch.get_num_threads()
+    yield before
+    torch.set_num_threads(before)
+
+
 @pytest.mark.parametrize(
     ("granted", "asked", "threads"),
     [(0.5, None, 1), (1.9, None, 1), (2.5, None, 2), (8.0, None, None), (1.0, "3", "3")],
 )
-def test_a_container_of_few_cores_gets_few_threads(granted, asked, threads, monkeypatch):
+def test_a_container_of_few_cores_gets_few_threads(
+    granted, asked, threads, monkeypatch, torch_threads
+):
     """Of a machine of eight cores, of which a control group grants so many."""
     import torch
 
@@ -599,13 +611,42 @@ def test_a_container_of_few_cores_gets_few_threads(granted, asked, threads, monk
     monkeypatch.setenv("OMP_NUM_THREADS", asked or "")
     if asked is None:
         monkeypatch.delenv("OMP_NUM_THREADS")
-    before = torch.get_num_threads()
-    try:
-        take_threads(None)
-        assert os.environ.get("OMP_NUM_THREADS") == (None if threads is None else str(threads))
-        assert torch.get_num_threads() == (threads if isinstance(threads, int) else before)
-    finally:
-        torch.set_num_threads(before)
+    take_threads(None)
+    assert os.environ.get("OMP_NUM_THREADS") == (None if threads is None else str(threads))
+    assert torch.get_num_threads() == (threads if isinstance(threads, int) else torch_threads)
+
+
+@pytest.mark.usefixtures("torch_threads")
+@pytest.mark.parametrize(("asked", "cores", "threads"), [(1, 8, 1), (8, 8, 8), (10**9, 2, 2)])
+def test_more_threads_than_cores_are_not_started(asked, cores, threads, monkeypatch):
+    monkeypatch.setattr("univoxel.core.system.usable_cores", lambda: cores)
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    take_threads(asked)
+    assert os.environ["OMP_NUM_THREADS"] == str(threads)
+
+
+@pytest.mark.usefixtures("torch_threads")
+def test_threads_of_a_batch_may_be_of_larger_machines(calls, monkeypatch):
+    """As examples/slurm_batch.py asks for, on a node that only submits."""
+    monkeypatch.setattr("univoxel.core.system.usable_cores", lambda: 1)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    asked = {}
+    calls.give("univoxel.cli.batch", batch=lambda _, threads: asked.update(threads=threads) or [])
+    main(["batch", "scenes", "--out", "night", "--threads", "16"])
+    assert asked == {"threads": 16}
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="a call of Linux")
+def test_threads_of_a_process_that_may_use_one_core():
+    """As taskset and `docker --cpuset-cpus` leave it."""
+    code = (
+        "import os, sys\nos.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
+        "from univoxel.cli import main\nsys.exit(main(['doctor', '--json', '-']))"
+    )
+    env = {name: text for name, text in os.environ.items() if name != "OMP_NUM_THREADS"}
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env)
+    found = {one["what"]: one["found"] for one in json.loads(run.stdout)}
+    assert found["threads"] == "1 on 1 cores"
 
 
 def test_threads_are_known_before_torch_is_imported():

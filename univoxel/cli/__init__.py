@@ -155,7 +155,7 @@ def _run(arguments: list[str]) -> int:
         return 2
     if call is None:
         return 0
-    take_threads(call.common.threads)
+    take_threads(call.common.threads, elsewhere=call.name == "batch")
     try:
         with spoken(call.common, results_alone=call.run.keywords.get("json") == STDOUT):
             return shown(call.run())
@@ -227,13 +227,17 @@ def lab() -> None:
     """Run experiments, in a clone of the repository."""
 
 
-def take_threads(threads: int | None) -> None:
+def take_threads(threads: int | None, elsewhere: bool = False) -> None:
     """Set the number of threads of kernels, torch and child processes.
 
     None: OMP_NUM_THREADS, or else one per core. If a control group grants fewer cores, as in a
-    container, OpenMP does not see it, and the surplus threads would wait.
+    container, OpenMP does not see it, and the surplus threads would wait. So would those of a
+    number beyond the cores, of which torch leaves out the surplus only where it has MKL. With
+    `elsewhere` the number is of processes on other machines, which may have more cores.
     """
-    if threads is None:
+    if threads is not None:
+        threads = threads if elsewhere else min(threads, system.usable_cores())
+    else:
         granted = machine.cores()
         if "OMP_NUM_THREADS" in os.environ or granted >= system.usable_cores():
             return

@@ -102,7 +102,7 @@ class Common:
     verbose: bool = False
     """print details, elapsed seconds, and the traceback of an error"""
     threads: Annotated[int | None, written("N", "one per core")] = None
-    """number of threads"""
+    """number of threads, at most one per core"""
 
 
 @dataclass(frozen=True)

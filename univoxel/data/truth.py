@@ -245,9 +245,7 @@ def _arrays(path: Path, factor: int) -> Truth:
         with np.errstate(over="ignore"):  # what is infinite then is refused
             value = arrays[key].astype(np.float32)
         if value.shape != size:
-            raise DataError(
-                f"{path}: expected {key} of shape {list(size)}, got {list(value.shape)}"
-            )
+            raise DataError(f"{path}: expected {key} of {list(size)}, got {list(value.shape)}")
         if not np.isfinite(value).all():
             raise DataError(f"{path}: expected finite {key}, got NaN or infinity")
         fields[key] = _shrunk(key, torch.from_numpy(value), alpha, factor)
