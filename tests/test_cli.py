@@ -347,8 +347,8 @@ def test_experiments(calls, tmp_path, capsys):
     scenes = (Path("cup"), Path("shoe"))
     assert [given for _, given, _ in calls.noted] == [
         (scenes, Path("out"), "draft", lights, 2.0, ("seed=1",), 4),
-        ((Path("cup"),), Path("out"), "draft", "sg", True, (), ("seed=1",), 4),
-        ((Path("cup"),), Path("out"), "fast", "hybrid", False, ("draft", "fast"), (), 64),
+        ((Path("cup"),), Path("out"), "draft", "sg", True, (), ("seed=1",), 4, 1),
+        ((Path("cup"),), Path("out"), "fast", "hybrid", False, ("draft", "fast"), (), 64, 1),
     ]
     assert capsys.readouterr().out.split() == ["table", "picture", "picture"]
     calls.give("lab.stress.suite", stress=calls.task("stress", "breaks"))

@@ -137,7 +137,7 @@ def test_without_embree_the_error_says_how_to_get_it(monkeypatch):
             return 0
 
     monkeypatch.setattr(ops.native, "core", Core)
-    with pytest.raises(RuntimeError, match=r"built without Embree.*libembree-dev.*rebuild"):
+    with pytest.raises(RuntimeError, match=r"built without it.*libembree-dev.*rebuild"):
         ops.VisibilityScene(*soup())
     with ops.use_backend("reference"):
         scene = ops.VisibilityScene(*soup())

@@ -369,7 +369,7 @@ def numbers(surveyed: Survey) -> dict[str, float]:
         return where.float().mean().item()
 
     seen = surveyed.views > 0
-    errors = dict(zip(QUANTITIES, surveyed.errors.unbind(1), strict=True))
+    errors: dict[str, Tensor] = dict(zip(QUANTITIES, surveyed.errors.unbind(1), strict=True))
     return {
         **{f"{name}_error": error.mean().item() for name, error in errors.items()},
         **{f"{name}_good": share(errors[name] < most) for name, (most, _) in GOOD.items()},

@@ -316,17 +316,17 @@ def explained(
 # light, is taken out before.
 
 
-# Share of the cost under a gain for each photograph that has to go away: on the tuning half of the
-# bank 0.08 at most under one light, and 0.17 and more, but for 0.1 on polished metal, under several
-VARIED = 0.12
+# Mean Cauchy cost of an observation under a gain for each photograph that has to go away: on the
+# tuning half of the bank 0.10 at most under one light, and 0.18 to 0.26 under several
+VARIED = 0.14
 # Points of either half that a photograph shows at least
 COMMON = 40
 
 
 @torch.no_grad()
 def varied_light(photos: Photos, hull: Tensor, grid: GridShape, gains: Tensor | None) -> float:
-    """How much more a light for each photograph explains than a gain for each: the share of the
-    cost that it takes away, 0 where it is not certain.
+    """How much more a light for each photograph explains than a gain for each: the mean Cauchy
+    cost of an observation that it takes away, 0 where it is not certain.
 
     Args:
         photos, hull, grid, gains: as in `light_frame_of`.
@@ -343,21 +343,23 @@ def varied_light(photos: Photos, hull: Tensor, grid: GridShape, gains: Tensor | 
     rest = _robust(values, common[:, :0], point)[1]
     half = random_half(len(observations.position), point)
     shade, nothing = smooth(normal).double(), torch.zeros(len(rest), 0, dtype=torch.double)
-    costs = torch.zeros(2, len(rest), dtype=torch.double)
+    costs, compared = torch.zeros(2, len(rest), dtype=torch.double), torch.zeros_like(half)
     for seen in (view == v for v in range(len(photos))):
         if min(int((seen & half).sum()), int((seen & ~half).sum())) < COMMON:
             continue
         for part in (seen & half, seen & ~half):
-            other = seen & ~part
+            other, compared = seen & ~part, compared | part
             for cost, basis in zip(costs, (nothing, shade), strict=True):
                 fitted, left = _robust(rest[other], basis[other], torch.zeros_like(point[other]))
                 level = (rest[other] - basis[other] @ fitted - left).mean()
                 cost[part] = _cost(rest[part] - basis[part] @ fitted - level)
-    ahead = ahead_by(costs[0] - costs[1], view)
-    log.debug("light of each photograph: costs %s, ahead by %s", costs.sum(1).tolist(), ahead)
-    if ahead is None or ahead < CERTAIN:
+    if not compared.any():
         return 0.0
-    return 1 - float(costs[1].sum() / costs[0].sum())
+    saved = (costs[0] - costs[1])[compared]
+    ahead = ahead_by(saved, view[compared])
+    told = [round(float(cost[compared].mean()), 3) for cost in costs]
+    log.debug("light: gains leave %s, a light for each photograph %s, ahead by %s", *told, ahead)
+    return float(saved.mean()) if ahead is not None and ahead > CERTAIN else 0.0
 
 
 def comparable(

@@ -311,13 +311,11 @@ def prepare(
     varying, gains = varying_and_gains(photos, hull, grid, cfg.scene.varying, cfg.exposures)
     frame = light_frame_of(photos, hull, grid, cfg.light_frame, gains)
     if cfg.exposures and frame == LightFrame() and isinstance(cfg.scene.light, LocalLightConfig):
-        saved = varied_light(photos, hull, grid, gains)
-        if saved > VARIED:
+        if varied_light(photos, hull, grid, gains) > VARIED:
             varying = "light"
             log.info(
-                "light differs between photographs, so each gets its own, which explains %.0f %% "
-                "more of the colour changes than exposures do; varying=none switches this off",
-                100 * saved,
+                "light differs between photographs, so each gets a light of its own; varying=none "
+                "switches this off",
                 extra={"arguments": ("varying",)},
             )
     pinned, in_world = None, frame == LightFrame()
