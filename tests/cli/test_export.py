@@ -241,7 +241,7 @@ def test_what_the_box_cuts_is_closed(tmp_path, monkeypatch):
         ("a.glb", {"texture_size": 8}, "power of 2 from 16 to 4096, got 8"),
         ("a.glb", {"texture_size": -64}, "got -64"),
         ("a.glb", {"texture_format": "webp"}, "texture_format must be png or jpeg, got webp"),
-        ("a.glb", {"quality": 96}, "quality must be 1 to 95, got 96"),
+        ("a.glb", {"quality": 96}, "quality must be from 1 to 95, got 96"),
         ("a.glb", {"size": 0.0}, "size must be above 0, got 0"),
         ("a.glb", {"size": float("nan")}, "size must be above 0, got nan"),
         (
@@ -249,8 +249,8 @@ def test_what_the_box_cuts_is_closed(tmp_path, monkeypatch):
             {"origin": "top"},
             "origin must be upright or world or bottom or centre, got top",
         ),
-        ("a.glb", {"lods": -1}, "lods must be 0 to 8, got -1"),
-        ("a.glb", {"lods": 9}, "lods must be 0 to 8, got 9"),
+        ("a.glb", {"lods": -1}, "lods must be from 0 to 8, got -1"),
+        ("a.glb", {"lods": 9}, "lods must be from 0 to 8, got 9"),
         (
             "a.glb",
             {"lods": 3, "faces": 2000},

@@ -323,7 +323,7 @@ def test_a_training_says_how_it_came_out(data, tmp_path, caplog):
     assert verdict.evidence.psnr > 10
     assert (run / "trust.txt").read_text().startswith(verdict.sentence() + ". ")
     assert any(message.startswith("Result: ") for message in caplog.messages)
-    assert "12 photographs of 0.001 MP: about" in caplog.text
+    assert "12 photographs of 0.001 MP: training takes about" in caplog.text
 
 
 def test_a_limit_may_be_enough_for_the_steps_alone(caplog):
