@@ -17,6 +17,7 @@ from univoxel.lights.base import (
     LocalLightConfig,
     Regularisation,
 )
+from univoxel.ops.networks import MLP
 
 
 def rotations(
@@ -173,8 +174,8 @@ class BasisLight(AbstractLocalLight):
         super().__init__()
         self.config = config
         outputs = 3 * count
-        self.head = base.build_head(features, config.hidden, config.layers, outputs, generator)
-        self.base = nn.Parameter(torch.zeros(count, 3))
+        self.head: MLP = base.build_head(features, config.hidden, config.layers, outputs, generator)
+        self.base: nn.Parameter = nn.Parameter(torch.zeros(count, 3))
 
     @abstractmethod
     def basis(self, wi: Tensor) -> Tensor:
