@@ -64,10 +64,7 @@ BLACK = 0.02
 # terms of `Survey.errors`. Fitted to the tuning half of the bank
 QUANTITIES = ("albedo", "roughness", "normal")  # sRGB, as it is, degrees
 EXPECTED = {
-    "albedo": (
-        -0.77,
-        {"disagreement": 0.39, "visibility": -0.36, "variation": 0.32, "clipped": 1.17},
-    ),
+    "albedo": (-3.81, {"undetermined": 2.37, "variation": 0.31, "clipped": 0.92}),
     "roughness": (-0.88, {"disagreement": 0.33, "information": 0.12, "roughness": 1.19}),
     "normal": (0.96, {"bumpiness": 0.32, "visibility": -0.91, "spread": 0.60}),
 }
@@ -102,7 +99,9 @@ class Survey:
     @property
     def terms(self) -> dict[str, Tensor]:
         """What expected errors depend on, [P] each."""
+        determined = self.seen_with(self.straight) * self.visibility * self.agreeing
         return {
+            "undetermined": 1 - determined,
             "disagreement": self.disagreement_nearby.clamp_min(0.003).log(),
             "visibility": self.visibility.clamp_min(0.05).log(),
             "variation": self.variation.clamp_min(0.01).log(),
