@@ -179,6 +179,7 @@ def test_expected_errors_are_those_of_the_nearest_on_the_same_side(surveyed):
     up = torch.tensor([0.0, 0.0, 1.0]).expand(200, 3)
     values = (
         *(("views", 9), ("straight", 9.0), ("visibility", 1.0), ("disagreement_nearby", 0.0)),
+        ("disagreement", 0.0),
         *(("gloss", 1e3), ("bumpiness", 0.0), ("variation", 0.0), ("spread", 2), ("clipped", 0.0)),
         ("recovered_roughness", 0.0),
     )
