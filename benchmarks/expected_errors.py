@@ -5,7 +5,7 @@
 
 BANK holds scenes/ and runs/. Prints the weights that fit all scenes, and how well those that are
 fitted to the other scenes foretell each one: rank correlation, mean error by tenths of the expected
-one, and below which expected error nine of ten places are good.
+one, and how many of the places that are called good are.
 """
 
 from __future__ import annotations
@@ -99,9 +99,8 @@ class Report:
     in_a_scene: float  # rank correlation, mean of the scenes
     over_all: float  # rank correlation of all pixels
     tenths: list[tuple[float, float]]  # mean expected and true error, by expected error
-    limit: float  # error that good places are below
-    good_below: float  # largest expected error up to which nine of ten places are
-    share: float  # of the pixels that are expected to be so good
+    called_good: float  # share of the pixels, by `confidence.GOOD`; 0: none is ever called so
+    right: float  # share of these whose error is below the limit
 
 
 def report_of(name: str, terms: list[np.ndarray], errors: list[np.ndarray]) -> Report:
@@ -113,13 +112,10 @@ def report_of(name: str, terms: list[np.ndarray], errors: list[np.ndarray]) -> R
     p, y = np.concatenate(told), np.concatenate(errors)
     order = np.argsort(p)
     tenths = [(float(p[k].mean()), float(y[k].mean())) for k in np.array_split(order, 10)]
-    limit = GOOD[name][1] if name in GOOD else 0.2
-    bad = np.cumsum(y[order] > limit) / np.arange(1, len(p) + 1)
-    good = np.flatnonzero(bad <= 0.1)
-    below = float(p[order[good[-1]]]) if len(good) else 0.0
-    pooled = spearman(torch.from_numpy(p), torch.from_numpy(y))
-    share = float((p <= below).mean())
-    return Report(float(np.mean(ranks)), float(pooled), tenths, limit, below, share)
+    most, limit = GOOD.get(name, (0.0, 0.0))
+    good, pooled = p < most, spearman(torch.from_numpy(p), torch.from_numpy(y))
+    right = float((y[good] < limit).mean()) if good.any() else 0.0
+    return Report(float(np.mean(ranks)), float(pooled), tenths, float(good.mean()), right)
 
 
 def record_of(reports: dict[str, Report], label: str, half: str, count: int) -> dict[str, Any]:
