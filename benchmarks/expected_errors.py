@@ -5,7 +5,8 @@
 
 BANK holds scenes/ and runs/. Prints the weights that fit all scenes, and how well those that are
 fitted to the other scenes foretell each one: rank correlation, mean error by tenths of the expected
-one, and how many of the places that are called good are.
+one, and how many of the places that are called good are so. Prints also the mean errors where no
+photograph sees the surface, `UNSEEN`.
 """
 
 from __future__ import annotations
@@ -44,8 +45,11 @@ class Constant:
 
 
 @torch.no_grad()
-def collected(run: Path, data: Path) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Terms and true errors at random pixels of the test views where some photograph sees them."""
+def collected(
+    run: Path, data: Path
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Terms and true errors at random pixels of the test views where some photograph sees them; and
+    true errors at all where none does."""
     scene, _ = load_checkpoint(run)
     surveyed = survey(scene, photos_of(run, split="train"), POINTS)
     tree = KDTree(key_of(surveyed.position, surveyed.normal, surveyed.voxel_size))
@@ -61,10 +65,11 @@ def collected(run: Path, data: Path) -> tuple[dict[str, np.ndarray], dict[str, n
         for name, pairs in errors_of(layers, expected, scales).items():
             true[name].append(pairs[1].numpy())
     place = np.concatenate(near)
-    seen = (surveyed.views > 0).numpy()[place].nonzero()[0]
-    chosen = np.random.default_rng(0).permutation(seen)[:PIXELS]
+    seen = (surveyed.views > 0).numpy()[place]
+    chosen = np.random.default_rng(0).permutation(seen.nonzero()[0])[:PIXELS]
     terms = {name: value.numpy()[place[chosen]] for name, value in surveyed.terms.items()}
-    return terms, {name: np.concatenate(value)[chosen] for name, value in true.items()}
+    errors = {name: np.concatenate(value) for name, value in true.items()}
+    return terms, *({k: v[which] for k, v in errors.items()} for which in (chosen, ~seen))
 
 
 def fitted(terms: list[np.ndarray], errors: list[np.ndarray]) -> np.ndarray:
@@ -124,8 +129,7 @@ def record_of(reports: dict[str, Report], label: str, half: str, count: int) -> 
     digits = {"albedo": 3, "roughness": 2, "normal": 1}
     units = {"albedo": "sRGB", "roughness": "0 to 1", "normal": "degrees"}
     columns = [
-        {"name": f"{name}, {what}", "digits": digits[name]}
-        | ({"unit": units[name]} if units[name] else {})
+        {"name": f"{name}, {what}", "digits": digits[name], "unit": units[name]}
         for name in reports
         for what in ("expected", "true")
     ]
@@ -158,12 +162,14 @@ def main() -> None:
             print(scene.name, {k: round(float(v.mean()), 3) for k, v in found[-1][1].items()})
     reports = {}
     for name, (_, weights) in EXPECTED.items():
-        terms = [np.column_stack([t[key] for key in weights]).astype(float) for t, _ in found]
-        errors = [e[name].astype(float) for _, e in found]
+        terms = [np.column_stack([t[key] for key in weights]).astype(float) for t, *_ in found]
+        errors = [e[name].astype(float) for _, e, _ in found]
         constant, *others = fitted(terms, errors).round(2)
         print(f"{name}: {constant}, {dict(zip(weights, map(float, others), strict=True))}")
         reports[name] = report_of(name, terms, errors)
         print(f"  {reports[name]}")
+        unseen = np.concatenate([u[name] for *_, u in found])
+        print(f"  unseen: {unseen.mean():.3f} over {len(unseen)} pixels")
     if asked.out:
         asked.out.write_text(result_text(record_of(reports, asked.label, asked.half, len(found))))
 

@@ -177,7 +177,7 @@ def bank(
     """Measure quality and automatic decisions on random scenes.
 
     Renders random objects, materials, light and captures with Mitsuba 3 and trains on each. Reports
-    the mean quality, the share of correct decisions, and whether uncertainty predicts errors. One
+    the mean quality, the share of correct decisions, and how true expected errors are. One
     half of the scenes is for tuning and the other for judging; the seed determines which. Writes
     DIR/seed-N/judge-NAME.md and .json. Finished runs are kept: run the same command again to
     resume.

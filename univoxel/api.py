@@ -171,7 +171,7 @@ class Run:
 
     @property
     def trust(self) -> str:
-        """The result and its uncertainty in words, from trust.txt; empty if there is none."""
+        """The result and its expected errors in words, from trust.txt; empty if there is none."""
         file = self.path / "trust.txt"
         return file.read_text(encoding="utf-8") if file.is_file() else ""
 

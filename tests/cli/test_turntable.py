@@ -87,7 +87,7 @@ def test_which_light_it_was(photographs, light, caplog):
         assert "light: it rotates with the camera, as on a turntable" in caplog.text
 
 
-def test_light_of_its_own_for_each_photograph_is_found():
+def test_light_of_its_own_for_each_photograph_is_found(monkeypatch):
     """Lamps that are turned at random from photograph to photograph; exposures are no light."""
     generator = torch.Generator().manual_seed(1)
     turn = torch.stack([random_rotation(generator) for _ in range(VIEWS)])
@@ -99,6 +99,8 @@ def test_light_of_its_own_for_each_photograph_is_found():
     assert varied_light(differ, *hull_of(differ), None) > 2 * VARIED
     assert varied_light(still, *hull_of(still), None) < VARIED / 2
     assert varied_light(exposed, *hull_of(exposed), gains) < VARIED / 2
+    monkeypatch.setattr(light_frame, "VARIED_SHARE", 0.999)  # what is mirrored is no light
+    assert varied_light(differ, *hull_of(differ), None) == 0
     black = replace(still, color=torch.zeros_like(still.color))
     assert varied_light(black, *hull_of(black), None) == 0
 

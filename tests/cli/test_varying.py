@@ -29,6 +29,7 @@ from univoxel.config import JointConfig
 from univoxel.data import load_photos
 from univoxel.data.images import read_image
 from univoxel.lights import SGConfig
+from univoxel.preparation import prepare
 from univoxel.render.observations import prefiltered_roughness, shade_observations
 from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import Scene, SceneConfig, load_checkpoint, load_scene, save_scene
@@ -202,6 +203,24 @@ def test_training_starts_from_the_exposures_that_were_seen(tmp_path, monkeypatch
     assert learned.cfg.varying == "exposure"
     found = learned.views.log_gain.detach() / math.log(2)
     assert (found - wanted).square().mean().sqrt() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("saved", "changes", "varying"),
+    [
+        (1.01, {}, "light"),
+        (0.99, {}, "none"),
+        (9.0, {"exposures": False}, "none"),
+        (9.0, {"light_frame": "camera"}, "none"),
+    ],
+)
+def test_light_that_differs_is_learned(tmp_path, monkeypatch, saved, changes, varying):
+    monkeypatch.setattr(prepare, "varied_light", lambda *_: saved * prepare.VARIED)
+    monkeypatch.setattr(task, "run_stage", lambda *_: None)
+    stages = (plain_stage(voxels=0.01, iterations=1, share=1.0),)
+    changes = {"exposures": True} | changes
+    cfg = plain_training(write_scene(tmp_path / "data"), tmp_path / "run", stages, **changes)
+    assert load_scene(train(cfg)).cfg.varying == varying
 
 
 def test_the_light_of_a_view_from_the_command_line(tmp_path, capsys):

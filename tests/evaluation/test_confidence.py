@@ -12,6 +12,7 @@ from univoxel.data import Photos
 from univoxel.evaluation import confidence
 from univoxel.evaluation.confidence import (
     GOOD,
+    LARGEST,
     UNSEEN,
     ExpectedErrors,
     numbers,
@@ -83,7 +84,7 @@ def test_errors_are_expected_where_the_photographs_differ(scene, surveyed):
     albedo = surveyed.errors[:, 0]
     assert albedo[blue].mean() > 1.5 * albedo[red].mean()
     assert (surveyed.errors > 0).all()
-    assert (surveyed.errors <= torch.tensor(UNSEEN)).all()
+    assert (surveyed.errors <= torch.tensor(LARGEST)).all()
 
 
 def test_what_no_camera_sees_is_a_guess(scene, photos):
@@ -118,7 +119,7 @@ def test_each_term_counts_as_the_table_says(surveyed, monkeypatch):
     weights = {"disagreement": 0.5, "visibility": -1.0, "clipped": 2.0}
     table = {
         "albedo": (-3.0, weights),
-        "roughness": (-2.0, {"information": 1.0}),
+        "roughness": (-2.0, {"roughness": 1.0}),
         "normal": (1.0, {"spread": 1.0}),
     }
     monkeypatch.setattr(confidence, "EXPECTED", table)
@@ -138,7 +139,7 @@ def test_each_term_counts_as_the_table_says(surveyed, monkeypatch):
     ):  # fmt: skip
         changed = replace(point, **{name: value * one}).errors[0, 0]
         assert changed / told[0] == pytest.approx(times, rel=1e-4)
-    assert replace(point, spread=80 * one).errors[0, 2] == UNSEEN[2]
+    assert replace(point, spread=80 * one).errors[0, 2] == LARGEST[2]
 
 
 def test_surroundings_do_not_depend_on_how_many_points_are_surveyed(scene, photos, surveyed):
@@ -199,7 +200,7 @@ def test_words_leave_out_what_is_not_the_case(surveyed):
     said = words(figures, [])
     assert said.startswith("Expected error, mean over the surface: 0.")
     for name in GOOD:
-        assert f"{figures[f'{name}_good']:.0%} of the surface has a good {name}" in said
+        assert f"On {figures[f'{name}_good']:.0%} of the surface, the {name} is good" in said
     assert "cameras" not in said
     assert "differs" not in said
     assert "Photographs cannot separate the brightness" in said

@@ -82,6 +82,9 @@ def test_trials_are_as_many_as_time_is_kept_for(monkeypatch):
     assert metals[0] == pytest.approx(0.2, abs=0.01)
     assert metals[2] == 1
     assert metals[1] < 0.1
+    metals.clear()
+    initialised(scene, problem, 0.0, some_metal(problem, 0.2))
+    assert metals == [pytest.approx(0.2, abs=0.01)]  # time is over: the first one stands
 
 
 def test_half_of_the_observations_are_fitted_and_the_others_judge(monkeypatch):

@@ -1,4 +1,4 @@
-"""Report on a trained run: its quality, its uncertainty, and what to photograph next."""
+"""Report on a trained run: its quality, its expected errors, and what to photograph next."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ReportOptions:
 def command(asked: ReportOptions) -> Path:
     """Report how good a run is and what to photograph next.
 
-    The web page shows photographs beside their render, uncertainty on the surface, materials,
+    The web page shows photographs beside their render, expected errors, materials,
     light, the progress of training, and directions from which more photographs would help. It needs
     no ground truth.
     """

@@ -353,7 +353,7 @@ def trusted(scene: Scene, photos: Photos) -> Survey | None:
     try:
         return survey(scene, photos, REPORT_POINTS)
     except UserError as error:
-        log.info(f"no uncertainty report: {error}")
+        log.info(f"no expected errors are told: {error}")
         return None
 
 

@@ -280,7 +280,7 @@ def list_neilf(folder: Path, split: str) -> Listed:
         raise DataError(f"{path}: expected images with cameras (flg {PLACED}), got none")
     looked = f" (looked in {folder / 'inputs' / 'images'})"
     lost = left_out(str(path), missing, len(names) - unplaced, looked)
-    lost += [f"{unplaced} photographs left out, which have no camera"] if unplaced else []
+    lost += [f"{unplaced} photographs left out because they have no camera"] if unplaced else []
     return turned_up(folder, split, "NeILF layout", shots, lost)
 
 

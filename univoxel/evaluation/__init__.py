@@ -1,1 +1,1 @@
-"""Metrics of a trained scene against ground truth, and its uncertainty without ground truth."""
+"""Metrics of a trained scene against ground truth, and its expected errors without ground truth."""

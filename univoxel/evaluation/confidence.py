@@ -61,17 +61,17 @@ NOISE = 0.02
 BLACK = 0.02
 
 # Mean errors of places like this on rendered scenes: exp(constant + sum of weight * term), with the
-# terms of `Survey.errors`. Fitted to the tuning half of the bank
+# terms of `Survey.terms`. Fitted to the tuning half of the bank by benchmarks/expected_errors.py
 QUANTITIES = ("albedo", "roughness", "normal")  # sRGB, as it is, degrees
 EXPECTED = {
-    "albedo": (-4.08, {"undetermined": 2.68, "variation": 0.25, "clipped": 0.82}),
-    "roughness": (-1.25, {"disagreement": 0.31, "information": 0.04, "roughness": 1.33}),
-    "normal": (0.77, {"bumpiness": 0.30, "visibility": -0.98, "spread": 0.63}),
+    "albedo": (-3.83, {"undetermined": 2.44, "variation": 0.30, "clipped": 0.80}),
+    "roughness": (-1.48, {"disagreement": 0.29, "roughness": 1.38}),
+    "normal": (0.76, {"bumpiness": 0.31, "visibility": -0.96, "spread": 0.64}),
 }
 # sRGB; an expected error of the albedo that pictures show brightest
 ALBEDO_LIMIT = 0.2
-# Where no photograph sees the surface; no expected error is larger
-UNSEEN = (0.2, 0.3, 30.0)
+# Mean errors of the same scenes where no photograph sees the surface; and bounds of any error
+UNSEEN, LARGEST = (0.12, 0.2, 17.0), (1.0, 1.0, 90.0)
 # Points of the surface that bumpiness and variation are taken from, and how many lie around one
 AROUND_POINTS, AROUND = 20_000, 24
 
@@ -107,7 +107,6 @@ class Survey:
             "variation": self.variation.clamp_min(0.01).log(),
             "bumpiness": self.bumpiness.clamp_min(1e-3).log(),
             "spread": self.spread.clamp_min(2.0).log(),
-            "information": -(1 + self.information).log() / 2,
             "clipped": self.clipped,
             "roughness": self.recovered_roughness,
         }
@@ -116,10 +115,11 @@ class Survey:
     def errors(self) -> Tensor:
         """Expected errors [P, 3] of QUANTITIES, see EXPECTED."""
         terms, found = self.terms, []
-        for guess, (constant, weights) in zip(UNSEEN, EXPECTED.values(), strict=True):
+        bounds = UNSEEN, LARGEST, EXPECTED.values()
+        for guess, largest, (constant, weights) in zip(*bounds, strict=True):
             log_error = constant + sum(weight * terms[name] for name, weight in weights.items())
             assert isinstance(log_error, Tensor)
-            error = log_error.exp().clamp_max(guess)
+            error = log_error.exp().clamp_max(largest)
             found.append(torch.where(self.views > 0, error, guess))
         return torch.stack(found, 1)
 
@@ -394,8 +394,8 @@ def words(figures: dict[str, float], troubles: list[str]) -> str:
         f"sRGB), {figures['roughness_error']:.2f} for the roughness, {figures['normal_error']:.0f} "
         "degrees for the normals.",
         *(
-            f"{figures[f'{name}_good']:.0%} of the surface has a good {name}: on rendered scenes, "
-            f"nine of ten such places have an error below {limit:g}{UNITS[name]}."
+            f"On {figures[f'{name}_good']:.0%} of the surface, the {name} is good: on rendered "
+            f"scenes, nine of ten such places have an error below {limit:g}{UNITS[name]}."
             for name, (_, limit) in GOOD.items()
         ),
     ]
@@ -454,8 +454,8 @@ class AdviceConfig:
     most: int = setting(6, "maximum number of directions", least=1)
     least: float = setting(
         0.006,
-        "minimum worth of a photograph: the share of the surface, times its uncertainty, that "
-        "the photograph would resolve",
+        "minimum worth of a photograph: the share of the surface that it would show better, times "
+        "how little is known there",
         least=0,
         most=1,
     )

@@ -380,7 +380,7 @@ def facts_of(run: Path, total: float | None = None) -> list[str]:
 
 
 def about(run: Path, options: PageOptions, lights: Sequence[str]) -> str:
-    """The page's panel: notes, metrics, result and uncertainty, keys, sources."""
+    """The page's panel: notes, metrics, result and expected errors, keys, sources."""
     parts = [paragraph(options.notes)] if options.notes else []
     if options.measures:
         rows = [(escape(what), escape(value)) for what, value in options.measures.items()]
@@ -388,7 +388,7 @@ def about(run: Path, options: PageOptions, lights: Sequence[str]) -> str:
     trust = run / "trust.txt"
     if trust.is_file():
         text = trust.read_text(encoding="utf-8", errors="replace").strip()
-        parts.append(f"<h2>Result and uncertainty</h2>{paragraph(text)}")
+        parts.append(f"<h2>Result and expected errors</h2>{paragraph(text)}")
     parts.append(f"<h2>Keys</h2><p>{KEYS}</p>")
     sources = [SOURCES[name] for name in lights if name in SOURCES]
     text = " ".join([f"Made by univoxel {__version__}.", LICENCE, *sources])

@@ -1,5 +1,5 @@
 """A report on a run: one self-contained page, without scripts, with the quality of the run, its
-uncertainty, and what to photograph next.
+expected errors, and what to photograph next.
 
 It uses no ground truth.
 """
@@ -238,11 +238,12 @@ def report_text(
     front = START[0] if known is None else known.advice.front
     errors = None if known is None else ExpectedErrors(known.surveyed)
     pictures = report_pictures.layers(scene, mesh, options.size, front, errors, options.albedo_near)
+    painted = pictures.pop("error", [])
     verdict = load_verdict(run)
     sections = [
         ("Result", paragraph(verdict.sentence() + ".") if verdict else ""),
         ("What to photograph next", next_section(known.advice) if known else paragraph(why)),
-        ("Uncertainty", error_section(known, state, pictures.pop("error", [])) if known else ""),
+        ("Expected errors", error_section(known, state, painted) if known else ""),
         ("Photographs and renders", views_section(scene, known, options) if known else ""),
         ("Materials", materials_section(pictures)),
         ("Light", light_section(scene, mesh)),

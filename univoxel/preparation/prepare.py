@@ -310,14 +310,15 @@ def prepare(
     say_clipped(photos)
     varying, gains = varying_and_gains(photos, hull, grid, cfg.scene.varying, cfg.exposures)
     frame = light_frame_of(photos, hull, grid, cfg.light_frame, gains)
-    if cfg.exposures and frame == LightFrame() and isinstance(cfg.scene.light, LocalLightConfig):
-        if varied_light(photos, hull, grid, gains) > VARIED:
-            varying = "light"
-            log.info(
-                "light differs between photographs, so each gets a light of its own; varying=none "
-                "switches this off",
-                extra={"arguments": ("varying",)},
-            )
+    # A light for each photograph is one that differs from point to point, in the world
+    may_vary = cfg.exposures and isinstance(cfg.scene.light, LocalLightConfig)
+    if may_vary and frame == LightFrame() and varied_light(photos, hull, grid, gains) > VARIED:
+        varying = "light"
+        log.info(
+            "light differs between photographs, so each gets a light of its own; varying=none "
+            "switches this off",
+            extra={"arguments": ("varying",)},
+        )
     pinned, in_world = None, frame == LightFrame()
     if varying == "none" and in_world and begins(PINNED):
         pinned = find_pinned(silhouettes, photos.cameras, hull, grid)
