@@ -3,6 +3,7 @@
 #include <memory>
 
 #include "bindings/common.h"
+#include "texels.h"
 
 namespace univoxel {
 namespace {
@@ -39,8 +40,9 @@ void bind_chart_ops(py::module_& m) {
             }
             std::copy_n(mesh.indexArray, faces.size(), faces.mutable_data());
         });
-    def(m, "find_charts", "vertices faces size padding",
-        [](In<float> vertices, In<int32_t> faces, int size, int padding) {
+    def(m, "find_charts", "vertices faces regions size padding",
+        [](In<float> vertices, In<int32_t> faces, In<int32_t> regions, int size, int padding) {
+            require(3 * regions.size() == faces.size(), "charts: regions must be [F]");
             Charts charts{std::unique_ptr<xatlas::Atlas, Destroy>(xatlas::Create())};
             xatlas::MeshDecl mesh;
             mesh.vertexPositionData = vertices.data();
@@ -49,6 +51,7 @@ void bind_chart_ops(py::module_& m) {
             mesh.indexData = faces.data();  // a negative one is out of range as unsigned
             mesh.indexFormat = xatlas::IndexFormat::UInt32;
             mesh.indexCount = static_cast<uint32_t>(faces.size());
+            mesh.faceMaterialData = reinterpret_cast<const uint32_t*>(regions.data());
             const xatlas::AddMeshError error = xatlas::AddMesh(charts.atlas.get(), mesh);
             require(error == xatlas::AddMeshError::Success,
                     std::string("charts: ") + xatlas::StringForEnum(error));
@@ -60,6 +63,47 @@ void bind_chart_ops(py::module_& m) {
             pack.resolution = size, pack.padding = padding, pack.bilinear = true;
             xatlas::Generate(charts.atlas.get(), options, pack);
             return charts;
+        });
+    def(m, "rasterise", "uv faces owner barycentric top",
+        [](In<float> uv, In<int32_t> faces, Out<int32_t> owner, Out<float> barycentric,
+           int64_t top) {
+            const int64_t corners = uv.size() / 2;
+            require(uv.ndim() == 2 && owner.ndim() == 2 && barycentric.size() == 2 * owner.size() &&
+                        faces.size() % 3 == 0,
+                    "rasterise: sizes do not fit");
+            require(all_of<int32_t>(faces, [=](int32_t i) { return 0 <= i && i < corners; }),
+                    "rasterise: faces must name corners that exist");
+            rasterise(uv.data(), faces.data(), faces.size() / 3, owner.shape(1), top,
+                      owner.shape(0), owner.mutable_data(), barycentric.mutable_data());
+        });
+    def(m, "add_photograph",
+        "face barycentric corners shown values matrix mask linear picture total weights scale "
+        "clipped of_clipped threads",
+        [](In<int32_t> face, In<uint16_t> barycentric, In<int32_t> corners, In<uint8_t> shown,
+           In<float> values, In<float> matrix, In<float> mask, In<float> linear,
+           const std::variant<array<uint8_t>, array<float>>& picture, Out<float> total,
+           Out<float> weights, float scale, float clipped, float of_clipped, int threads) {
+            const int64_t k = face.size(), f = shown.size(), p = values.shape(0);
+            require(barycentric.size() == 2 * k && corners.size() == 3 * f &&
+                        values.size() == 13 * p && matrix.size() == 12 && mask.ndim() == 2 &&
+                        mask.size() > 0 && linear.size() == 256 && total.size() == 3 * k &&
+                        weights.size() == k,
+                    "add_photograph: sizes do not fit");
+            const auto below = [](int64_t n) { return [n](int32_t i) { return 0 <= i && i < n; }; };
+            require(all_of<int32_t>(face, below(f)) && all_of<int32_t>(corners, below(p)),
+                    "add_photograph: face and corners must name rows that exist");
+            std::visit(
+                [&](const auto& a) {
+                    require(a.ndim() == 3 && a.shape(2) == 3 && a.size() > 0,
+                            "add_photograph: picture must be [H, W, 3]");
+                    const auto in =
+                        make<Texels>(face, barycentric, corners, shown, values, matrix, mask,
+                                     linear, k, a.shape(0), a.shape(1), mask.shape(0),
+                                     mask.shape(1), scale, clipped, of_clipped);
+                    add_photograph(in, a.data(), total.mutable_data(), weights.mutable_data(),
+                                   threads);
+                },
+                picture);
         });
 }
 

@@ -73,7 +73,7 @@ def instances() -> dict[str, object]:
         "TouchedRows": core.touched_rows(dense, point, order, 8, True, False, 1)[0],
         "RowSet": core.touched_rows(sparse, point, order, 128, True, False, 1)[0],
         "Charts": core.find_charts(
-            np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), 8, 1
+            np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), order, 8, 1
         ),
         "HashRows": rows,
         "Strategy": core.Strategy.mis,

@@ -10,8 +10,8 @@ import torch
 from asymmetric_scene import lopsided
 
 from univoxel.core.records import Mesh
-from univoxel.ops.charts import unwrap
-from univoxel.output.mesh import dilated, rasterise, vertex_normals, vertex_tangents
+from univoxel.ops.charts import corner_weights, rasterise, unwrap
+from univoxel.output.mesh import dilated, vertex_normals, vertex_tangents
 from univoxel.output.topology import clean, simplify
 
 SQUARE = torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32)
@@ -63,7 +63,7 @@ def test_charts_of_a_face_without_its_vertex_are_refused():
 SEARCHES = """
 import torch
 from univoxel.core.records import Mesh
-from univoxel.ops.charts import unwrap
+from univoxel.ops.charts import corner_weights, rasterise, unwrap
 faces = torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 mesh = Mesh(torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), faces)
 for _ in range(2000):
@@ -133,11 +133,12 @@ def test_a_face_without_texture_still_has_a_frame():
 
 
 def test_texels_of_a_square(monkeypatch):
-    monkeypatch.setattr("univoxel.output.mesh.CANDIDATES", 100)  # several chunks
+    monkeypatch.setattr("univoxel.ops.charts.AT_ONCE", 100)  # several chunks
     size = 16
     uv = torch.cat([CORNERS * 0.5, CORNERS * 0.5 + 0.5])  # lower left and upper right quarter
     faces = torch.cat([SQUARE, SQUARE + 4])
-    texel, face, weight = rasterise(uv, faces, size)
+    texel, face, barycentric = rasterise(uv, faces, size)
+    weight = corner_weights(barycentric)
     row, column = texel // size, texel % size
     expected = torch.zeros(size, size, dtype=torch.bool)
     expected[8:, :8] = expected[:8, 8:] = True

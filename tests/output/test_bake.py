@@ -5,7 +5,8 @@ import torch
 from asymmetric_scene import albedo, lopsided, roughness
 
 from univoxel.core.records import Mesh
-from univoxel.output.mesh import bake, in_frame, nearest_surface, rasterise, with_materials
+from univoxel.ops.charts import corner_weights, rasterise
+from univoxel.output.mesh import bake, in_frame, nearest_surface, with_materials
 from univoxel.output.topology import clean, simplify
 
 
@@ -51,7 +52,8 @@ def test_texels_take_the_materials_and_the_normal(scene, mesh):
     size = 128
     out = bake(scene, mesh, size)
     assert ((out.uv >= 0) & (out.uv <= 1)).all()
-    texel, face, weight = rasterise(out.uv, out.faces, size)
+    texel, face, barycentric = rasterise(out.uv, out.faces, size)
+    weight = corner_weights(barycentric)
     corner = out.faces[face].long()
     point, n, t = (
         torch.einsum("kc,kcd->kd", weight, v[corner])
@@ -102,7 +104,7 @@ def test_frame_coordinates_solve_a_skewed_frame():
 def test_a_texture_that_is_too_small(scene, monkeypatch):
     nothing = torch.empty(0, dtype=torch.int64)
     monkeypatch.setattr(
-        "univoxel.output.mesh.rasterise", lambda *_: (nothing, nothing, torch.empty(0, 3))
+        "univoxel.output.mesh.rasterise", lambda *_: (nothing, nothing, torch.empty(0, 2))
     )
     mesh = clean(Mesh(*scene.field.isosurface()))
     with pytest.raises(ValueError, match="texture of 16 x 16 is too small for"):

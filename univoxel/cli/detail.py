@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 DETAIL_SIZES = (256, 8192)
 # What it takes on two quiet cores of a Xeon: charts, and a million pixels of photographs
-CHARTS_SECONDS, MEGAPIXEL_SECONDS = 12.0, 0.06
+CHARTS_SECONDS, MEGAPIXEL_SECONDS = 6.0, 0.02
 MOST_OF_LIMIT = 0.25  # of the minutes that a training has
 
 
@@ -84,11 +84,18 @@ def minutes_left(
     minutes: float | None, photos: Photos, detail: Detailing, threads: int
 ) -> float | None:
     """Of a training's limit in minutes, what is left beside detail; None: it has no limit."""
-    if minutes is None or detail == "none" or photos.downscale == 1:
-        return minutes
+    if minutes is None:
+        return None
+    seconds = seconds_for(photos, detail, threads)
+    return minutes - min(seconds / 60, MOST_OF_LIMIT * minutes)
+
+
+def seconds_for(photos: Photos, detail: Detailing, threads: int) -> float:
+    """What detail takes of a quiet machine, about; 0: there is none."""
+    if detail == "none" or photos.downscale == 1:
+        return 0.0
     pixels = float(photos.cameras.size_of_each().double().prod(1).sum()) * photos.downscale**2
-    seconds = CHARTS_SECONDS + MEGAPIXEL_SECONDS * pixels / 1e6
-    return minutes - min(seconds * 2 / (60 * max(threads, 1)), MOST_OF_LIMIT * minutes)
+    return (CHARTS_SECONDS + MEGAPIXEL_SECONDS * pixels / 1e6) * 2 / max(threads, 1)
 
 
 def made_after_training(

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from univoxel import config, lights
-from univoxel.cli.detail import made_after_training, minutes_left
+from univoxel.cli.detail import made_after_training, minutes_left, seconds_for
 from univoxel.core import log, memmap
 from univoxel.core.files import write_text
 from univoxel.core.progress_bar import duration
@@ -50,6 +50,7 @@ if TYPE_CHECKING:
 
 # Of preparation, a million pixels that are trained on, on two quiet cores of a Xeon
 PREPARATION_SECONDS = 1.0
+PAGE_SECONDS = 8.0  # of the page, or the mesh, that follows a training
 SLACK = 0.05  # of a limit that training may take of what detail was left
 
 
@@ -121,6 +122,8 @@ def _train(
     left = minutes_left(cfg.minutes, photos, cfg.detail, torch.get_num_threads())
     timed = replace(cfg, minutes=left)
     with Progress(timed, begin, state, told, slowdown(timed)) as progress:
+        after = seconds_for(photos, cfg.detail, torch.get_num_threads()) + PAGE_SECONDS
+        progress.clock.afterwards = progress.slower * after
         announce(progress, photos)
         scene, pinned, pixels, limited, box = ready(photos, cfg, begun and begun[0], progress)
         release_memory()  # preparation frees about 12 bytes a pixel
@@ -245,11 +248,12 @@ def announce(progress: Progress, photos: Photos) -> None:
     clock, cfg = progress.clock, progress.cfg
     pixels = len(photos) * photos.cameras.width * photos.cameras.height / 1e6
     before = clock.seconds + PREPARATION_SECONDS * progress.slower * pixels
-    whole = before + clock.planned + RESERVE_SECONDS
+    steps = before + clock.planned + RESERVE_SECONDS
+    whole = steps + clock.afterwards
     size = photos.downscale**2 * pixels / len(photos)
     what = f"{len(photos)} photographs of {size:.2g} MP"
     clock.preparation = min(before, config.PREPARATION * clock.limit)
-    if whole <= clock.limit:
+    if steps <= clock.limit:
         log.info(f"{what}: training takes about {duration(whole)} on this machine")
         return
     fits = max(clock.limit - clock.preparation - RESERVE_SECONDS, 0.0) / clock.planned

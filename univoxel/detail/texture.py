@@ -20,6 +20,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -31,23 +32,28 @@ from PIL import Image
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
-from torch.nn.functional import (
-    avg_pool2d,
-    embedding_bag,
-    grid_sample,
-    interpolate,
-    normalize,
-)
+from torch.nn.functional import avg_pool2d, interpolate, normalize
 
-from univoxel.camera import Cameras, pixel_width, project
-from univoxel.color import linear_to_srgb, luminance, srgb_to_linear
+from univoxel.camera import Cameras, pixel_width, project, projection_matrices
+from univoxel.color import linear_to_srgb
 from univoxel.core import log
 from univoxel.core.files import replacing
+from univoxel.core.progress_bar import track
 from univoxel.core.records import AlbedoNear, Mesh, Surface
 from univoxel.data import Photos
+from univoxel.data.photos import coverage_of
 from univoxel.errors import DataError
 from univoxel.ops import VisibilityScene
-from univoxel.ops.charts import unwrap
+from univoxel.ops.charts import (
+    LINEAR,
+    add_photograph_,
+    between,
+    corner_weights,
+    rasterise,
+    sampled,
+    seen_at_texels,
+    unwrap,
+)
 from univoxel.output.mesh import nearest_surface, surface_beside, vertex_normals
 from univoxel.output.surface import surface_of
 from univoxel.output.topology import simplify
@@ -68,13 +74,12 @@ FILL = 0.6  # of it that charts cover
 GRAZING = 0.1  # cosine to a camera, below which it does not count
 # Of the weight of the view that sees a vertex best: what has less adds nothing
 LEAST = 0.25
-CLIPPED, OF_CLIPPED = 0.98, 0.05  # linear; the weight of what is brighter
 # Weight, relative to that of a view that sees a texel best, of the model's own albedo: where
 # next to nothing is seen
 PRIOR = 0.02
 HELD_OUT, EVERY = 6, 8  # views, at most and one in so many, on which it is tried whether it helps
+JUDGED = 8  # one texel in so many is compared with photographs that were held out
 AT_ONCE = 1 << 18  # texels: bounds memory
-LINEAR = srgb_to_linear(torch.arange(256) / 255)  # of bytes
 
 
 @dataclass(frozen=True)
@@ -142,49 +147,6 @@ class Detail:
             found = self.at(hit.face[met], corner_weights(hit.barycentric[met]), footprint)
             out[some[met]] = found
         return out
-
-
-def corner_weights(barycentric: Tensor) -> Tensor:
-    """(u, v) [N, 2] of `ops.Hit` as weights of the three corners [N, 3]."""
-    return torch.cat([1 - barycentric.sum(1, keepdim=True), barycentric], 1)
-
-
-def linear(picture: Tensor) -> Tensor:
-    """A stored picture [..., 3], uint8 sRGB or float32 linear, as the latter."""
-    return LINEAR[picture.int()] if picture.dtype == torch.uint8 else picture
-
-
-def sampled(picture: Tensor, place: Tensor) -> Tensor:
-    """Linear colours [N, 3] of a picture at places, bilinear in linear light.
-
-    Args:
-        picture: [H, W, 3] uint8 sRGB, or float32 linear.
-        place: [N, 2] x to the right and y down, in pixels; a pixel's centre is at a half.
-    """
-    height, width = picture.shape[:2]
-    if not len(place):
-        return torch.zeros(0, 3)
-    # What is asked for, with a pixel around it
-    low = (place.amin(0).floor().int() - 1).tolist()
-    high = (place.amax(0).ceil().int() + 1).tolist()
-    x, y = (min(max(n, 0), size - 1) for n, size in zip(low, (width, height), strict=True))
-    part = picture[y : max(high[1], y + 1), x : max(high[0], x + 1)]
-    part = linear(part)
-    size = torch.tensor([part.shape[1], part.shape[0]])
-    at = 2 * (place - torch.tensor([x, y])) / size - 1
-    planes = part.movedim(-1, 0)[None]
-    found = grid_sample(planes, at[None, None], padding_mode="border", align_corners=False)
-    return found[0, :, 0].T
-
-
-def between(values: Tensor, corner: Tensor, weights: Tensor) -> Tensor:
-    """Values [P, C] of vertices at points of faces, [N, C].
-
-    Args:
-        corner: [N, 3] int32 rows of `values`.
-        weights: [N, 3] of the corners.
-    """
-    return embedding_bag(corner, values, per_sample_weights=weights, mode="sum")
 
 
 # What cameras see of a mesh, and how the model explains it.
@@ -298,16 +260,15 @@ def make_detail(scene: Scene, photos: Photos, size: int | None = None) -> Detail
     baking = _Baking(scene, photos, at, atlas, quality)
 
     held = list(range(EVERY // 2, len(photos), EVERY))[:HELD_OUT]
-    for view in range(len(photos)):
-        if view not in held:
-            baking.add(view)
-    errors = torch.tensor([baking.errors(view) for view in held])  # [H, 2]
+    for view, picture in _read(photos, [v for v in range(len(photos)) if v not in held]):
+        baking.add(view, picture)
+    errors = torch.tensor([baking.errors(*read) for read in _read(photos, held)])  # [H, 2]
     before, after = errors.nanmean(0).tolist() if len(held) else (math.nan, math.nan)
     if not after < before:
         log.info("detail: no texture added, because it would not predict photographs better")
         return None
-    for view in held:
-        baking.add(view)
+    for view, picture in _read(photos, held):
+        baking.add(view, picture)
     gain = -10 * math.log10(after / before)
     log.info(
         "detail: a texture of %d x %d from %d photographs, which predicts others %.1f dB better",
@@ -315,6 +276,17 @@ def make_detail(scene: Scene, photos: Photos, size: int | None = None) -> Detail
     )
     albedo = baking.picture()
     return Detail(mesh.vertices, mesh.faces, atlas.corners, atlas.uv, albedo, 2 * voxel)
+
+
+def _read(photos: Photos, views: list[int]) -> Iterator[tuple[int, Tensor]]:
+    """Views and their photographs at full size, the next of which is read meanwhile."""
+    with ThreadPoolExecutor(1) as pool:
+        coming = [pool.submit(photos.readers[view], 1) for view in views[:1]]
+        for view, following in zip(track(views, "texture"), [*views[1:], None], strict=True):
+            picture = coming.pop().result()
+            if following is not None:
+                coming.append(pool.submit(photos.readers[following], 1))
+            yield view, picture
 
 
 def _size(mesh: Mesh, quality: Tensor, downscale: int) -> int:
@@ -339,23 +311,10 @@ class _Atlas:
 
 
 def _atlas(mesh: Mesh, size: int) -> _Atlas:
-    """Charts of a mesh, and which texel lies on which face: rays through the flat charts tell."""
+    """Charts of a mesh, and which texel lies on which face."""
     _, corners, uv = unwrap(mesh, size)
-    flat = torch.cat([uv, torch.zeros(len(uv), 1)], 1)
-    charts = VisibilityScene(flat, corners)
-    found, rows = [], max(1, AT_ONCE // size)
-    for top in range(0, size, rows):
-        row, column = torch.meshgrid(
-            torch.arange(top, min(top + rows, size)), torch.arange(size), indexing="ij"
-        )
-        place = [(column + 0.5) / size, 1 - (row + 0.5) / size, torch.ones(row.shape)]
-        start = torch.stack(place, -1).reshape(-1, 3)
-        hit = charts.closest_hit(start, torch.tensor([0.0, 0.0, -1.0]).expand_as(start))
-        met = (hit.face >= 0).nonzero()[:, 0]
-        texel = (met + top * size).int()
-        found.append((texel, hit.face[met].int(), hit.barycentric[met].half()))
-    texel, face, barycentric = (torch.cat(part) for part in zip(*found, strict=True))
-    return _Atlas(size, corners, uv, texel, face, barycentric)
+    texel, face, barycentric = rasterise(uv, corners, size)
+    return _Atlas(size, corners, uv, texel.int(), face, barycentric.half())
 
 
 class _Baking:
@@ -369,38 +328,31 @@ class _Baking:
         best = quality.amax(1, keepdim=True).clamp_min(1e-30)
         self.weight = (quality / best - LEAST).clamp_min(0)
         self.shown = (quality[at.mesh.faces.long()] > 0).all(1)  # [F, V] without hidden corners
+        self.matrix = projection_matrices(photos.cameras)
         self.total = torch.zeros(len(atlas.texel), 3)
         self.weights = torch.zeros(len(atlas.texel))
 
-    def add(self, view: int) -> None:
-        """Add what a photograph says of the albedo."""
-        for some, color, a, b, albedo, weight in self._observed(view):
-            trusted = (
-                weight * luminance(a) * (color.amax(1) < CLIPPED).float().clamp_min(OF_CLIPPED)
-            )
-            model = a * albedo
-            own = model / (model + b).clamp_min(1e-6)  # share that is no reflection
-            trusted *= (luminance(model) / luminance(model + b).clamp_min(1e-6)).square()
-            value = ((color - b) / a.clamp_min(1e-3)).clamp(0, 1)
-            # What is left of a channel that reflections hide is a tint that nothing has: brightness
-            # is the photograph's then, and colour the model's
-            even = (own.amin(1) / own.amax(1).clamp_min(1e-6)).square()[:, None]
-            bright = luminance(value) / luminance(albedo).clamp_min(1e-4)
-            value = torch.lerp((albedo * bright[:, None]).clamp(0, 1), value, even)
-            self.total.index_add_(0, some, trusted[:, None] * value)
-            self.weights.index_add_(0, some, trusted)
+    def add(self, view: int, picture: Tensor) -> None:
+        """Add what a photograph [H, W, 3], as stored, says of the albedo."""
+        if (texels := self._texels(view, picture)) is not None:
+            add_photograph_(self.total, self.weights, *texels)
 
-    def errors(self, view: int) -> tuple[float, float]:
-        """Mean squared differences from a photograph, in sRGB, of model and of texture."""
-        sums = torch.zeros(3, dtype=torch.float64)
-        for some, color, a, b, albedo, weight in self._observed(view):
-            photo, known = linear_to_srgb(color), weight * (self.weights[some] > 0)
-            for k, value in enumerate((albedo, self._texture(some, albedo))):
-                error = (linear_to_srgb(a * value + b) - photo).square().mean(1)
-                sums[k] += (known * error).sum()
-            sums[2] += known.sum()
-        model, texture = (sums[:2] / sums[2]).tolist()
-        return model, texture
+    def errors(self, view: int, picture: Tensor) -> tuple[float, float]:
+        """Mean squared differences from a photograph, in sRGB, of model and of texture.
+
+        Of one texel in `JUDGED`, for speed.
+        """
+        if (texels := self._texels(view, picture)) is None:
+            return math.nan, math.nan
+        face, barycentric, *rest = texels
+        some, color, at = seen_at_texels(face[::JUDGED], barycentric[::JUDGED], *rest)
+        a, b, albedo, weight = at[:, :3], at[:, 3:6], at[:, 9:12], at[:, 12]
+        photo, known = linear_to_srgb(color), weight * (self.weights[JUDGED * some] > 0)
+        sums = []
+        for value in (albedo, self._texture(JUDGED * some, albedo)):
+            error = (linear_to_srgb(a * value + b) - photo).square().mean(1)
+            sums.append(float((known * error).double().sum() / known.double().sum()))
+        return sums[0], sums[1]
 
     def picture(self) -> Tensor:
         """The texture, with its background filled from beside it: [T, T, 3] uint8 sRGB."""
@@ -425,39 +377,22 @@ class _Baking:
         weights = corner_weights(self.atlas.barycentric[some].float())
         return between(values, self.at.mesh.faces[self.atlas.face[some]], weights)
 
-    def _observed(self, view: int) -> Iterator[tuple[Tensor, ...]]:
-        """Texels [N] that a photograph shows, its linear colours [N, 3], A, B and the model's
-        albedo, and weights [N], in parts."""
+    def _texels(self, view: int, picture: Tensor) -> tuple[Any, ...] | None:
+        """Arguments of `add_photograph_`; None: the photograph shows nothing."""
         weight, faces = self.weight[:, view], self.at.mesh.faces.long()
         shown = self.shown[:, view] & (weight[faces].amax(1) > 0)
         if not shown.any():
-            return
-        cameras, factor = self.photos.cameras, self.photos.downscale
+            return None
         known = torch.zeros(len(weight), dtype=torch.bool)
         known[faces[shown].reshape(-1)] = True
-        values = torch.zeros(len(weight), 13)  # A, B, weight, place, albedo
+        values = torch.zeros(len(weight), 13)
         part = at_rays(self.at.surface, known)
-        values[known, :6] = torch.cat(split(self.scene, part, cameras, view, view), 1)
-        values[:, 6], values[:, 7:10] = weight, self.at.mesh.vertices
-        values[:, 10:] = self.at.surface.albedo
-        pixel, _ = project(cameras, view, self.at.mesh.vertices[known])
-        low, high = ((factor * x).int() for x in (pixel.amin(0).floor(), pixel.amax(0).ceil()))
-        left, top = low.sub(2).clamp_min(0).tolist()
-        right, bottom = high.add(2).tolist()
-        picture = linear(self.photos.readers[view](1)[top:bottom, left:right])
-        alpha = self.photos.stored(view)[1]
-        alpha = (alpha.float() / (255 if alpha.dtype == torch.uint8 else 1))[None, None]
-        size = torch.tensor(cameras.size(view))
-        some = shown[self.atlas.face].nonzero()[:, 0]
-        for index in some.split(AT_ONCE):
-            at = self._between(values, index)
-            pixel, _ = project(cameras, view, at[:, 7:10])
-            place = (2 * pixel / size - 1)[None, None]
-            cover = grid_sample(alpha, place, align_corners=False)[0, 0, 0]
-            kept = ((at[:, 6] > 0) & (cover > 0.95)).nonzero()[:, 0]
-            at = at[kept]
-            color = sampled(picture, factor * pixel[kept] - torch.tensor([left, top]))
-            yield index[kept], color, at[:, :3], at[:, 3:6], at[:, 10:], at[:, 6]
+        values[known, :6] = torch.cat(split(self.scene, part, self.photos.cameras, view, view), 1)
+        values[:, 6:9], values[:, 9:12] = self.at.mesh.vertices, self.at.surface.albedo
+        values[:, 12] = weight
+        alpha = coverage_of(self.photos.stored(view)[1])
+        place = self.atlas.face, self.atlas.barycentric, self.at.mesh.faces, shown
+        return *place, values, self.matrix[view], alpha, picture, self.photos.downscale
 
 
 def _filled(picture: Tensor, known: Tensor) -> Tensor:

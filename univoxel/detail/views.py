@@ -32,16 +32,13 @@ from univoxel.data.photos import coverage_of
 from univoxel.detail.texture import (
     Detail,
     Vertices,
-    between,
-    corner_weights,
-    linear,
     load_detail,
-    sampled,
     seen_from,
     split,
     vertices_of,
 )
 from univoxel.evaluation.measures import render_layers
+from univoxel.ops.charts import between, corner_weights, linear, sampled
 from univoxel.render.metrics import ssim
 from univoxel.render.pipeline import at_rays
 from univoxel.scene import Scene

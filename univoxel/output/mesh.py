@@ -20,7 +20,7 @@ from univoxel.core.choices import Origin
 from univoxel.core.records import AlbedoNear, FieldSample, Mesh
 from univoxel.errors import UserError
 from univoxel.fields.field import Field
-from univoxel.ops.charts import unwrap
+from univoxel.ops.charts import corner_weights, rasterise, unwrap
 from univoxel.scene import Scene
 
 # glTF and USD look along -Z with +Y up, our world has +Z up: (x, y, z) -> (x, z, -y), a quarter
@@ -76,9 +76,6 @@ def encoded(picture: np.ndarray, jpeg: int | None) -> bytes:
 # A texture over a mesh: the frames of its vertices, and which texel lies where.
 
 
-CANDIDATES = 1 << 22  # texels looked at together: bounds memory
-
-
 def vertex_normals(mesh: Mesh) -> Tensor:
     """Unit normals [P, 3] of the vertices: the mean over their faces, weighted by the angle there.
 
@@ -122,40 +119,6 @@ def vertex_tangents(vertices: Tensor, faces: Tensor, normals: Tensor, uv: Tensor
     return torch.cat([_unit(_reject(tangent, n)), sign], 1).float()
 
 
-def rasterise(uv: Tensor, faces: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The texels whose centres lie in a triangle.
-
-    Texel (row r, column c) has its centre at u = (c + 0.5) / size, v = 1 - (r + 0.5) / size.
-
-    Returns:
-        texel [K] int64 = r * size + c, each once; face [K] int64; barycentric [K, 3] float32.
-    """
-    corner = uv.double().numpy()[faces.long().numpy()] * [size, -size] + [0, size]
-    low = np.ceil(corner.min(1) - 0.5).astype(np.int64).clip(0)
-    high = np.floor(corner.max(1) - 0.5).astype(np.int64).clip(None, size - 1)
-    extent = (high - low + 1).clip(0)
-    count = extent.prod(1)
-    owner = np.full(size * size, -1, np.int64)
-    weights = np.zeros((size * size, 3), np.float32)
-    chunk = (np.cumsum(count) // CANDIDATES) if len(count) else count
-    for some in np.split(np.arange(len(count)), np.flatnonzero(np.diff(chunk)) + 1):
-        face = np.repeat(some, count[some])
-        first = np.repeat(np.cumsum(count[some]) - count[some], count[some])
-        row, column = np.divmod(np.arange(len(face)) - first, extent[face, 0])
-        column, row = column + low[face, 0], row + low[face, 1]
-        a, b, c = corner[face].transpose(1, 0, 2)
-        p = np.stack([column, row], 1) + 0.5
-        area = _cross(b - a, c - a)
-        with np.errstate(divide="ignore", invalid="ignore"):  # triangles without area hold nothing
-            wb, wc = _cross(p - a, c - a) / area, _cross(b - a, p - a) / area
-        inside = (wb >= 0) & (wc >= 0) & (wb + wc <= 1)
-        texel = (row * size + column)[inside]
-        owner[texel] = face[inside]
-        weights[texel] = np.stack([1 - wb - wc, wb, wc], 1)[inside]
-    texel = np.flatnonzero(owner >= 0)
-    return torch.from_numpy(texel), torch.from_numpy(owner[texel]), torch.from_numpy(weights[texel])
-
-
 def dilated(texel: Tensor, size: int) -> Tensor:
     """For each texel of a picture the nearest of the given ones, as an index into `texel`: [T, T].
 
@@ -169,10 +132,6 @@ def dilated(texel: Tensor, size: int) -> Tensor:
     place = np.zeros(size * size, np.int64)
     place[texel.numpy()] = np.arange(len(texel))
     return torch.from_numpy(place[row * size + column])
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 def _unit(x: Tensor) -> Tensor:
@@ -284,7 +243,8 @@ def bake(
     source, faces, uv = unwrap(mesh, size)
     vertices, normals = mesh.vertices[source], vertex_normals(mesh)[source]
     tangents = vertex_tangents(vertices, faces, normals, uv)
-    texel, face, weight = rasterise(uv, faces, size)
+    texel, face, barycentric = rasterise(uv, faces, size)
+    weight = corner_weights(barycentric)
     if not len(texel):
         raise UserError(f"a texture of {size} x {size} is too small for {len(faces)} faces")
     seen = None if mesh.seen is None else mesh.seen[source]

@@ -113,6 +113,7 @@ class Clock:
         self._in_rounds = False  # whether the present stage has blocks off the pace
         self._expected = [slower * expected_seconds(stage) for stage in cfg.stages]
         self.preparation: float = 0.0  # seconds that preparation is expected to end at
+        self.afterwards: float = 0.0  # seconds of what follows the last stage: texture and page
 
     def state(self) -> dict[str, Any]:
         """What a later sitting needs to continue; JSON."""
@@ -168,7 +169,8 @@ class Clock:
 
     @property
     def remaining(self) -> float:
-        """Seconds until the end, about: what stages are expected to take, as measured so far."""
+        """Seconds until the end, about: what stages are expected to take, as measured so far, and
+        what follows them."""
         measured = sum(self.took) + self.done * self.stage_took
         ended = self.stage if len(self.took) == self.stage else 0  # of a run of an older version
         expected = sum(self._expected[:ended])
@@ -183,11 +185,9 @@ class Clock:
         shares = [stage.share for stage in self.cfg.stages]
         begun = sum(shares[: self.stage]) + self.done * sum(shares[self.stage : self.stage + 1])
         least = LEAST * (1 - PREPARATION) * self.limit * (1 - begun / sum(shares))
-        return (
-            seconds
-            if math.isinf(self.limit)
-            else min(seconds, max(self.limit - self.seconds, least))
-        )
+        if math.isfinite(self.limit):
+            seconds = min(seconds, max(self.limit - self.seconds, least))
+        return seconds + self.afterwards
 
     @property
     def work_done(self) -> float:
@@ -275,7 +275,8 @@ class Clock:
         stages to come materials and light would lack. A stage of rounds is left as it is."""
         if self.finished:
             return
-        left = max(min(self.limit - RESERVE_SECONDS - self.seconds, self.remaining), 0.0)
+        left = min(self.limit - RESERVE_SECONDS - self.seconds, self.remaining - self.afterwards)
+        left = max(left, 0.0)
         hurried = min(left, max(HURRY * left, HURRY_SECONDS))
         self.limit, self.finished = self.seconds + hurried + RESERVE_SECONDS, True
         if self._in_rounds:  # one may take longer than all that is left
