@@ -1,6 +1,7 @@
 #include "stereo.h"
 
 #include "bindings/common.h"
+#include "hull.h"
 #include "patches.h"
 
 namespace univoxel {
@@ -50,6 +51,20 @@ void bind_patch_correlation(py::module_& m) {
         });
 }
 
+/// The points and views of maps [V, H, W].
+ViewedPoints viewed(In<float> points, In<float> matrix, In<int32_t> sizes, In<float> maps) {
+    require(maps.ndim() == 3 && points.size() % 3 == 0 && matrix.size() == 12 * maps.shape(0) &&
+                sizes.size() == 2 * maps.shape(0),
+            "points, views and their maps do not fit");
+    for (int64_t v = 0; v < maps.shape(0); ++v) {
+        const int32_t width = sizes.data()[2 * v], height = sizes.data()[2 * v + 1];
+        require(1 <= width && width <= maps.shape(2) && 1 <= height && height <= maps.shape(1),
+                "sizes of views must lie in those of their maps");
+    }
+    return make<ViewedPoints>(points, matrix, sizes, points.size() / 3, maps.shape(0),
+                              maps.shape(1), maps.shape(2));
+}
+
 }  // namespace
 
 void bind_stereo_ops(py::module_& m) {
@@ -76,6 +91,28 @@ void bind_stereo_ops(py::module_& m) {
             require(sum.size() == cost.size(), "semi_global: sum must be of cost's size");
             semi_global(cost.data(), rows.data(), rows.shape(0), rows.shape(1), cost.shape(0),
                         cost.shape(1), small, large, sum.mutable_data(), threads);
+        });
+    def(m, "hull_sdf", "points matrix sizes distance uncut focal sdf votes seen_by wider threads",
+        [](In<float> points, In<float> matrix, In<int32_t> sizes, In<float> distance,
+           In<uint8_t> uncut, In<float> focal, Out<float> sdf, int64_t votes, int64_t seen_by,
+           float wider, int threads) {
+            const ViewedPoints in = viewed(points, matrix, sizes, distance);
+            require(uncut.size() == in.V && focal.size() == in.V && sdf.size() == in.N,
+                    "hull_sdf: sizes do not fit");
+            require(votes >= 1, "hull_sdf: votes must be at least 1");
+            hull_sdf(in, distance.data(), uncut.data(), focal.data(), votes, seen_by, wider,
+                     sdf.mutable_data(), threads);
+        });
+    def(m, "count_votes", "points matrix sizes mask distance known eye sums band threads",
+        [](In<float> points, In<float> matrix, In<int32_t> sizes, In<float> mask,
+           In<float> distance, In<uint8_t> known, In<float> eye, Out<float> sums, float band,
+           int threads) {
+            const ViewedPoints in = viewed(points, matrix, sizes, distance);
+            require(mask.size() == distance.size() && known.size() == distance.size() &&
+                        eye.size() == 3 * in.V && sums.size() == 7 * in.N,
+                    "count_votes: sizes do not fit");
+            count_votes(in, mask.data(), distance.data(), known.data(), eye.data(), band,
+                        sums.mutable_data(), threads);
         });
     bind_patch_correlation<float>(m);
     bind_patch_correlation<double>(m);

@@ -1,12 +1,15 @@
 """Bounds and visual hull from silhouettes of a sphere."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from analytic import RADIUS, cameras_around, sphere_normals
 
 from univoxel.camera import Cameras
 from univoxel.fields.grid import GridShape, fit_grid, resample
-from univoxel.preparation import hull
+from univoxel.preparation import hull, object_shape
+from univoxel.preparation.stereo import DepthMaps
 
 
 @pytest.fixture(scope="module")
@@ -158,3 +161,30 @@ def test_distances_of_large_pictures_are_those_of_smaller_ones():
     assert off.max() < 2  # of hundreds
     kept = hull.mask_distances((0.5 - true).clamp(0, 1)[None, 101:1100, 101:1100])[0]
     assert (kept - true[101:1100, 101:1100]).abs().max() < 0.51  # of 999 pixels: not shrunk
+
+
+@pytest.mark.parametrize("votes", [1, 3])
+def test_kernels_of_points_are_as_their_references(votes):
+    """With cut silhouettes, pictures of two sizes and points beside, behind and in the object."""
+    generator = torch.Generator().manual_seed(0)
+    cameras = cameras_around(7, 40)
+    cameras = replace(cameras, sizes=torch.tensor([[40, 40], [40, 31]]).repeat(4, 1)[:7])
+    distance = torch.randn(7, 40, 40, generator=generator) * 20 + 5
+    distance[:3, [0, -1]] = distance[:3, :, [0, -1]] = 3.0  # these stay clear of the border
+    points = 3 * torch.randn(5000, 3, generator=generator)
+    for seen_by, wider in ((1, 0.0), (4, 1.5)):
+        given = distance, cameras, points, votes, seen_by, wider
+        one, two = hull.hull_sdf(*given), hull.hull_sdf_reference(*given)
+        # Where a point is just on a picture's border, or depths are tiny, rounding decides
+        close = torch.isclose(one, two, rtol=1e-4, atol=1e-4) | (one == two)
+        assert close.float().mean() > 0.998
+    grid = fit_grid(torch.tensor([-1.02, -0.93, -1.07]), torch.full((3,), 1.01), 4000)
+    known = torch.rand(7, 40, 40, generator=generator) > 0.3
+    maps = DepthMaps(cameras, 2 + torch.rand(7, 40, 40, generator=generator), known, 0.1)
+    masks = [cameras.cut(v, known[v]).float() for v in range(7)]
+    found = object_shape.votes(masks, maps, grid)
+    nodes, band = grid.nodes().reshape(-1, 3), object_shape.BAND * grid.voxel_size
+    sums = object_shape.votes_reference(masks, maps, nodes, band)
+    for one, two in zip(vars(found).values(), sums, strict=True):
+        assert torch.isclose(one.flatten(), two, atol=1e-4).float().mean() > 0.998
+        assert two.any()

@@ -8,7 +8,7 @@ from scipy import ndimage
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
-from univoxel.camera import Cameras, looked_at, project
+from univoxel.camera import Cameras, looked_at, project, projection_matrices
 from univoxel.core import memmap
 from univoxel.core.memmap import parallel_map
 from univoxel.core.records import Mesh
@@ -17,7 +17,7 @@ from univoxel.data.photos import coverage_of
 from univoxel.errors import UserError
 from univoxel.fields.distances import DenseDistances
 from univoxel.fields.grid import GridShape, fit_coarse, fit_grid, resample
-from univoxel.ops import VisibilityScene
+from univoxel.ops import VisibilityScene, native
 from univoxel.render.observations import Observations, observe, surface_points
 
 # The half of the first box over what the widest view shows at its distance
@@ -39,9 +39,6 @@ DOUBTED_VOTES = 0.07
 # Share of the views that have to see a node where masks are doubted. Orbits have the whole object
 # in nearly all of their pictures
 DOUBTED_SEEN = 0.25
-
-# Points that a thread works on at a time: what is computed of them stays in its cache
-PIECE = 2**15
 
 
 def mask_distances(alpha: Tensor, cameras: Cameras | None = None) -> Tensor:
@@ -117,29 +114,41 @@ def hull_sdf(
         seen_by: views, >= 1, that have to be able to say anything of a point; others are outside.
         wider: pixels that silhouettes are taken to be wider by.
     """
+    if not native.serves(points):
+        return hull_sdf_reference(distance, cameras, points, votes, seen_by, wider)
+    sdf, uncut = points.new_empty(len(points)), torch.zeros(len(cameras), dtype=torch.uint8)
+    for v in range(len(cameras)):
+        uncut[v] = _uncut(cameras.cut(v, distance[v]), wider)
+    sizes, focal = cameras.size_of_each().int(), cameras.focal.mean(1)
+    views = points, projection_matrices(cameras), sizes, distance, uncut, focal
+    arrays = native.arrays(*(t.contiguous() for t in views), sdf)
+    native.require().hull_sdf(*arrays, votes, seen_by, wider, native.threads())
+    return sdf
 
-    def of_piece(piece: Tensor) -> Tensor:
-        return _hull_sdf(distance, cameras, piece, votes, seen_by, wider)
 
-    return torch.cat(parallel_map(of_piece, points.split(PIECE)))
+def _uncut(shown: Tensor, wider: float) -> bool:
+    """Whether a silhouette stays clear of the border of its picture [H, W] of distances."""
+    border = [shown[0], shown[-1], shown[:, 0], shown[:, -1]]
+    return all(float(b.amin()) > wider for b in border)
 
 
-def _hull_sdf(
+def hull_sdf_reference(
     distance: Tensor, cameras: Cameras, points: Tensor, votes: int, seen_by: int, wider: float
 ) -> Tensor:
+    """Reference in eager PyTorch."""
     highest = torch.full((votes, len(points)), -torch.inf)  # of the views so far, the largest first
     voters = torch.zeros(len(points), dtype=torch.int64)
     for v in range(len(cameras)):
         pixel, depth = project(cameras, v, points)
         uv = pixel * (2 / torch.tensor(cameras.size(v))) - 1
         shown = cameras.cut(v, distance[v])
-        if wider:
-            shown = shown - wider
-        border = [shown[0], shown[-1], shown[:, 0], shown[:, -1]]
-        uncut = all(float(b.amin()) > 0 for b in border)
-        d = torch.nn.functional.grid_sample(
-            shown[None, None], uv[None, None], align_corners=False, padding_mode="border"
-        )[0, 0, 0]
+        uncut = _uncut(shown, wider)
+        d = (
+            -wider
+            + torch.nn.functional.grid_sample(
+                shown[None, None], uv[None, None], align_corners=False, padding_mode="border"
+            )[0, 0, 0]
+        )
         seen = (depth > 0) & (uv.abs() <= 1).all(1)
         bound = d.clamp_min(0.5) if uncut else torch.full_like(d, -torch.inf)
         bound = torch.where(seen, d, bound) * depth.abs() / cameras.focal[v].mean()

@@ -13,13 +13,13 @@ from skimage.measure import label
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from univoxel.camera import Cameras, image_rays, looked_at, project
+from univoxel.camera import Cameras, image_rays, looked_at, project, projection_matrices
 from univoxel.core.memmap import parallel_map
 from univoxel.core.progress_bar import track
 from univoxel.errors import UserError
 from univoxel.fields.distances import DenseDistances
 from univoxel.fields.grid import GridShape, fit_grid, resample
-from univoxel.ops import VisibilityScene
+from univoxel.ops import VisibilityScene, native
 from univoxel.preparation.hull import votes_needed
 from univoxel.preparation.stereo import DepthMaps, pixels_of, reach
 
@@ -302,32 +302,44 @@ def votes(masks: Sequence[Tensor], maps: DepthMaps, grid: GridShape) -> Votes:
         masks: V, [H, W] in [0, 1] of the sizes of the depth maps.
     """
     nodes, band = grid.nodes().reshape(-1, 3), BAND * grid.voxel_size
-
-    def of_piece(piece: Tensor) -> Tensor:
-        total = torch.zeros(7, len(piece))
+    if native.serves(nodes):
+        sums, cameras = nodes.new_empty(7, len(nodes)), maps.cameras
+        shown = torch.zeros_like(maps.distance)
         for view, mask in enumerate(masks):
-            row, column, seen = pixels_of(maps.cameras, view, piece)
-            eye = maps.cameras.camera_to_world[view, :, 3]
-            clear = maps.distance[view][row, column] - (piece - eye).norm(dim=1)
-            known = maps.known[view][row, column] & seen
-            near = known & (clear.abs() <= band)
-            shown = torch.where(seen, mask[row, column], 0.0)
-            hidden = known & (clear < -band)
-            total += torch.stack(
-                [
-                    seen,
-                    shown,
-                    known & (clear > band),
-                    near,
-                    torch.where(near, -clear / band, 0.0),
-                    seen & ~hidden,
-                    torch.where(hidden, 0.0, shown),
-                ]
-            )
-        return total
+            cameras.cut(view, shown[view]).copy_(mask)
+        eye, sizes = cameras.camera_to_world[:, :, 3], cameras.size_of_each().int()
+        known = maps.known.view(torch.uint8)
+        views = nodes, projection_matrices(cameras), sizes, shown, maps.distance, known, eye
+        arrays = native.arrays(*(t.contiguous() for t in views), sums)
+        native.require().count_votes(*arrays, band, native.threads())
+    else:
+        sums = votes_reference(masks, maps, nodes, band)
+    return Votes(*sums.view(-1, *grid.size))
 
-    pieces = parallel_map(of_piece, nodes.split(1 << 15))
-    return Votes(*torch.cat(pieces, 1).view(-1, *grid.size))
+
+def votes_reference(masks: Sequence[Tensor], maps: DepthMaps, nodes: Tensor, band: float) -> Tensor:
+    """Reference in eager PyTorch: the fields of `Votes` at nodes [N, 3], [7, N]."""
+    total = torch.zeros(7, len(nodes))
+    for view, mask in enumerate(masks):
+        row, column, seen = pixels_of(maps.cameras, view, nodes)
+        eye = maps.cameras.camera_to_world[view, :, 3]
+        clear = maps.distance[view][row, column] - (nodes - eye).norm(dim=1)
+        known = maps.known[view][row, column] & seen
+        near = known & (clear.abs() <= band)
+        shown = torch.where(seen, mask[row, column], 0.0)
+        hidden = known & (clear < -band)
+        total += torch.stack(
+            [
+                seen,
+                shown,
+                known & (clear > band),
+                near,
+                torch.where(near, -clear / band, 0.0),
+                seen & ~hidden,
+                torch.where(hidden, 0.0, shown),
+            ]
+        )
+    return total
 
 
 def free_and_surface(found: Votes) -> tuple[Tensor, Tensor]:
