@@ -194,7 +194,7 @@ def test_other_options_are_refused(tmp_path):
     assert run_job(job).state == "done"
     job.check_same()
     other = dataclasses.replace(job, identity={"seed": 2, "steps": 2})
-    with pytest.raises(ExistingFile, match=r"mug\.json has other values of seed: choose"):
+    with pytest.raises(ExistingFile, match=r"mug\.json differs in seed from this call: choose"):
         other.check_same()
 
 

@@ -96,11 +96,11 @@ class Job:
         before = self.record()["identity"]
         other = [key for key, value in self.identity.items() if before and before.get(key) != value]
         if other:
-            where = f"{self.name}: {self.file('.json')} has other values of {' and '.join(other)}"
+            where = f"{self.name}: {self.file('.json')} differs in {' and '.join(other)}"
             hint = (
-                "choose another folder for out, or remove that file and the folder of its results"
+                "choose another folder for out, or remove that file and the results of this scene"
             )
-            raise ExistingFile(f"{where}: {hint}", "out")
+            raise ExistingFile(f"{where} from this call: {hint}", "out")
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ class InspectOptions:
     out: Annotated[File | None, written("FILE.png", "in RUN/inspect")] = None
     """image to write; its layers are written beside it as .exr"""
     height: Annotated[int, written("ROWS")] = MAP_ROWS
-    """rows of the environment maps in the image"""
+    """number of rows of the environment maps in the image"""
     light_of: LightOf = None
     """training view (name or number) whose light to draw; see train --varying"""
 

@@ -16,7 +16,7 @@ class ReportOptions:
     run: Run
     """folder of a trained run"""
     html: Annotated[Path | None, written("FILE.html", "RUN/report.html")] = None
-    """page to write; it works offline"""
+    """web page to write, which works offline"""
     data: DataOf = None
     """folder of the photographs, if they were moved"""
     views: Annotated[int, written("N")] = 4

@@ -35,7 +35,7 @@ def command(asked: ViewOptions) -> Path | None:
     """View and relight a run in a browser, or write a web page.
 
     Returns:
-        The page, which is written atomically; None after a server has ended.
+        The page, which is written atomically; None if a server was started instead.
 
     Raises:
         UserError: the run or a map cannot be used, there is no surface, or the port is in use.

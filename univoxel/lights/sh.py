@@ -20,7 +20,7 @@ class SHConfig(LocalLightConfig):
     """Local light in spherical harmonics."""
 
     kind: Literal["sh"] = field(default="sh", init=False, metadata=KIND)
-    order: int = setting(3, "highest degree; a point has 3 (order + 1)^2 numbers", least=0)
+    order: int = setting(3, "highest degree; a point has 3 (order + 1)^2 coefficients", least=0)
     hidden: int = setting(64, "width of the head", least=1)
     layers: int = setting(2, "hidden layers of the head", least=0, most=MOST_LAYERS)
     directions: int = setting(256, "directions in training", least=1, most=MOST_DIRECTIONS)

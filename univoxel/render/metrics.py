@@ -178,7 +178,7 @@ def sample_mesh(mesh: Mesh, count: int, generator: torch.Generator) -> Tensor:
     area = torch.linalg.cross(b - a, c - a).norm(dim=1)
     total = area.cumsum(0)
     if not len(total) or not total[-1] > 0:
-        raise ValueError(f"sample_mesh: expected a mesh with area, got {len(area)} triangles")
+        raise ValueError(f"sample_mesh: expected a mesh with area > 0, got {len(area)} triangles")
     u = torch.rand(count, 3, generator=generator, dtype=torch.float64)
     face = torch.searchsorted(total, u[:, 0] * total[-1], right=True).clamp_max(len(area) - 1)
     root = u[:, 1:2].sqrt()  # Turk 1990, "Generating random points in triangles"
