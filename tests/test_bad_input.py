@@ -273,5 +273,5 @@ def test_the_template_is_sound(run, tmp_path):
         read_exr(out / "r_0.exr")
     )
     assert 0 <= json.loads((out / "a.json").read_text())["trust"]["albedo_error"] <= 1
-    assert "Expected error, mean over the surface" in (run / "trust.txt").read_text()
+    assert "Mean expected error of the surface" in (run / "trust.txt").read_text()
     assert read_image(run / "preview.png").shape == (16, 5 * 16, 3)

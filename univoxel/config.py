@@ -72,7 +72,7 @@ class StageConfig:
     plate: float = setting(
         0.003, "thin-plate smoothing of the updated sdf nodes, per step", least=0, most=0.125
     )
-    spread: int = setting(4, "smoothing passes over the sdf's gradient", least=0)
+    spread: int = setting(4, "number of smoothing passes over the gradient of the sdf", least=0)
     diffusion: float = setting(
         0.01, "smoothing of the updated feature nodes, per step", least=0, most=0.25
     )
@@ -315,7 +315,7 @@ def check_same(cfg: TrainConfig) -> None:
         if began.get(name) != now[name]:
             raise UserError(
                 f"{path}: the run was started with another {name}: to resume it, pass the same "
-                f"{', '.join(CHOICES[:-1])} and {CHOICES[-1]} as then",
+                f"{', '.join(CHOICES[:-1])} and {CHOICES[-1]} as before",
                 *CHOICES,
             )
 

@@ -204,7 +204,7 @@ def judge(evidence: Evidence) -> Verdict:
         GOOD_HIDDEN,
         POOR_HIDDEN,
         "{:.0%} of the surface is seen by too few cameras",
-        "take more photographs (`univoxel report` shows from where)",
+        "take more photographs from the directions that `univoxel report` shows",
     )
     check(
         evidence.residual,

@@ -77,7 +77,7 @@ class SceneConfig:
         False, "whether camera poses are optimised, see PoseSteps; set by training"
     )
     views: tuple[str, ...] = setting(
-        (), "names of the photographs, if something changes between them; set by training"
+        (), "names of the photographs, if anything is learned for each one; set by training"
     )
 
     def __post_init__(self) -> None:
@@ -490,7 +490,7 @@ def _compare_rows(name: str, table: Tensor, rows: Tensor, values: Tensor) -> Non
     count = table.numel() // math.prod(channels)
     if rows.dtype != torch.int32 or list(values.shape) != [*rows.shape, *channels]:
         raise ValueError(
-            f"expected {name} as int32 rows with {channels} values each, got rows "
+            f"expected int32 rows of {name} with {channels} values each, got rows "
             f"{list(rows.shape)} {rows.dtype} and values {list(values.shape)}"
         )
     if count > ROWS_FOR_ONE * (len(rows) + ROWS_FOR_ONE):

@@ -308,7 +308,7 @@ def test_mistakes_are_found_before_anything_is_begun(scenes, tmp_path, monkeypat
     other.mkdir(parents=True)
     refused(UserError, "folders with different names, got .*ball and .*ball", [scenes[0], other])
     (tmp_path / "logs").mkdir()
-    refused(UserError, "a scene cannot be named 'logs': rename the folder", [tmp_path / "logs"])
+    refused(UserError, "the name 'logs' is reserved: rename the folder", [tmp_path / "logs"])
     for name in ("jobs", "threads", "tries"):
         refused(UserError, f"{name} must be at least 1, got 0", **{name: 0})
     for field, value, match in (

@@ -252,7 +252,7 @@ def test_in_depth_a_box_ends_the_table_that_is_kept(tmp_path, room):
     [
         (["--box", "0", "0", "0", "1", "1", "0"], "--box: expected X0 Y0 Z0 X1 Y1 Z1 with X0 < X1"),
         (["--box", "0", "0", "0", "1"], "--box"),
-        (["--keep-table", "--from", "none"], "--keep-table needs masks from depth (none)"),
+        (["--keep-table", "--from", "none"], "--keep-table needs a box that bounds the table"),
         (
             ["--from", "none", "--network", "u2net"],
             "--network u2net applies only to masks from rembg",

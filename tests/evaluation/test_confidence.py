@@ -198,7 +198,7 @@ def test_words_leave_out_what_is_not_the_case(surveyed):
     still = replace(surveyed, disagreement=agreeing, views=views)
     figures = numbers(still)
     said = words(figures, [])
-    assert said.startswith("Expected error, mean over the surface: 0.")
+    assert said.startswith("Mean expected error of the surface: 0.")
     for name in GOOD:
         assert f"On {figures[f'{name}_good']:.0%} of the surface, the {name} is good" in said
     assert "cameras" not in said

@@ -131,7 +131,7 @@ def test_photographs_stand_beside_their_render_the_worst_first(run, text):
 
 def test_expected_errors_are_painted_and_told(text):
     said = section(text, "Expected errors")
-    assert "Expected error, mean over the surface: 0." in said
+    assert "Mean expected error of the surface: 0." in said
     names = [name for name, _ in pictures(said)]
     assert names == ["front", "right", "back", "left"]
 

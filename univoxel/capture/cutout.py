@@ -228,8 +228,8 @@ def check_masks(origin: str, network: str, box: Sequence[float] | None, keep_tab
     if keep_table and (box is None or origin != DEPTH):
         got = "no box" if box is None else f"masks from {origin}"
         raise UserError(
-            f"keep_table needs masks from depth ({DEPTH}) and a box that bounds the table, got "
-            f"{got}",
+            f"keep_table needs a box that bounds the table, and masks from depth ({DEPTH}), "
+            f"got {got}",
             "keep_table",
         )
 

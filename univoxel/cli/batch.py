@@ -38,7 +38,7 @@ class BatchOptions:
     masks: Annotated[str, parsing.written("auto|rembg|FOLDER|none")] = "auto"
     """source of the masks in the masks step, as for capture --masks"""
     preset: choices.PresetOrAuto = "auto"
-    """amount of work, from draft to best; auto: chosen to fit --minutes, else fast"""
+    """amount of work, from draft to best; auto: to fit --minutes, or fast without it"""
     light: Annotated[choices.LightName, parsing.ADVANCED] = "hybrid"
     """lighting model; hybrid keeps shadows out of the albedo; the others are baselines"""
     minutes: parsing.Minutes = None
@@ -56,7 +56,7 @@ class BatchOptions:
     tries: Annotated[int, parsing.ADVANCED] = 3
     """number of attempts at a scene whose process is killed"""
     json: parsing.JsonFile = None
-    """write batch.json to this file as well; - prints it instead of the table"""
+    """also write batch.json to this file; - prints it instead of the table"""
 
     def training(self) -> TrainConfig:
         """The configuration of a training; a UserError if there is none of that kind."""

@@ -52,7 +52,7 @@ class CaptureOptions:
     keep_table: Annotated[bool, ADVANCED] = False
     """keep the part of the table that is inside the box; needs --masks none"""
     preset: choices.PresetOrAuto = "auto"
-    """amount of work, from draft to best; auto: chosen to fit --minutes, else fast"""
+    """amount of work, from draft to best; auto: to fit --minutes, or fast without it"""
     light: Annotated[choices.LightName, ADVANCED] = "hybrid"
     """lighting model; hybrid keeps shadows out of the albedo; the others are baselines"""
     minutes: Minutes = None
@@ -60,7 +60,7 @@ class CaptureOptions:
     changes: Changes = ()
     """change one configuration field, such as loss.radiance=0.5; repeatable"""
     until: choices.Until = "page"
-    """last step to run; cameras, masks: stop before training and print the folder"""
+    """last step to run; cameras and masks stop before training and print the folder"""
 
     @property
     def fingerprint(self) -> Any:

@@ -37,7 +37,7 @@ class ExportOptions:
     run: Run
     """folder of a trained run"""
     mesh: Annotated[File, written("FILE.glb|usdz|obj|ply")]
-    """mesh file to write; .glb, .usdz and .obj have textures, .ply vertex colours"""
+    """mesh file to write; .glb, .usdz and .obj have textures, .ply has vertex colours"""
     faces: Annotated[int | None, written("N", "20000 with textures, else no limit")] = None
     """maximum number of triangles, at least 4"""
     texture_size: Annotated[

@@ -38,12 +38,12 @@ class InspectOptions:
 def inspect(asked: InspectOptions) -> Path:
     """Draw the light that reaches one point of the surface.
 
-    If the data set has ground truth, its light is drawn beside it.
+    If the data set has ground truth, the true light is drawn beside the recovered light.
 
     Raises:
         DataError: the run or its data cannot be read.
-        UserError: no such view or pixel, or no surface under it; an argument out of range;
-            light_of is no training view, or light does not vary.
+        UserError: the view or pixel does not exist, there is no surface under the pixel, another
+            argument is out of range, or the run has no light for light_of.
         OSError: a file cannot be written.
     """
     # The PNG holds a lat-long picture for each thing the scene knows: its local light, its distant

@@ -30,8 +30,8 @@ def command(asked: ReportOptions) -> Path:
     """Report how good a run is and what to photograph next.
 
     The web page shows photographs beside their render, expected errors, materials,
-    light, the progress of training, and directions from which more photographs would help. It needs
-    no ground truth.
+    light, the progress of training, and directions from which more photographs would help. The
+    report needs no ground truth.
     """
     return report(**vars(asked))
 

@@ -28,7 +28,7 @@ class TrainOptions:
     out: Annotated[parsing.File, parsing.written("RUN")]
     """folder to write the run to"""
     preset: choices.PresetOrAuto = "auto"
-    """amount of work, from draft to best; auto: chosen to fit --minutes, else fast"""
+    """amount of work, from draft to best; auto: to fit --minutes, or fast without it"""
     light: Annotated[choices.LightName, parsing.ADVANCED] = "hybrid"
     """lighting model; hybrid keeps shadows out of the albedo; the others are baselines"""
     varying: Annotated[choices.Differing, parsing.ADVANCED] = "auto"

@@ -214,8 +214,8 @@ def _paired(masks: Sequence[Path], root: Path | None, photographs: Named) -> lis
         if root is not None and mask and whose.setdefault(mask, image) != image:
             raise DataError(
                 f"{mask}: expected a mask of one photograph, but its name matches {whose[mask]} "
-                f"and {image}: put each mask into a subfolder named like its photograph's, or "
-                f"name it after the whole file name, like {image.name}.png"
+                f"and {image}: put each mask into a subfolder named like that of its photograph, "
+                f"or name it after the whole file name, such as {image.name}.png"
             )
         found.append(mask)
     return found

@@ -234,7 +234,7 @@ def compare(
     which: tuple[Tensor, Tensor],
     roughness_step: float,
 ) -> tuple[Tensor, Tensor]:
-    """Mean absolute difference in sRGB of photographs and render, and root mean square of the
+    """Mean absolute sRGB difference between photographs and render, and root mean square of the
     render's slope by roughness: [P] each; 0 for points without observations.
 
     A clipped pixel is only a lower bound of the brightness.
@@ -390,7 +390,7 @@ def words(figures: dict[str, float], troubles: list[str]) -> str:
         troubles: what went wrong in training, from its state.
     """
     sentences = [
-        f"Expected error, mean over the surface: {figures['albedo_error']:.2f} for the albedo (in "
+        f"Mean expected error of the surface: {figures['albedo_error']:.2f} for the albedo (in "
         f"sRGB), {figures['roughness_error']:.2f} for the roughness, {figures['normal_error']:.0f} "
         "degrees for the normals.",
         *(

@@ -303,8 +303,8 @@ def next_section(advice: Advice) -> str:
     legend = (
         "Directions around the object, seen from above. White dots: photographs. Bright areas: "
         "a photograph from there would help. Rings: gaps without photographs. Numbers: "
-        "photographs to take, the best first. Worth: the largest share of the surface that a "
-        "photograph could resolve."
+        "photographs to take, the best first. Worth: the share of the surface that a "
+        "photograph would show better, weighted by uncertainty."
     )
     left = "\n".join(parts)
     figure = f"<figure>{report_pictures.sphere(advice)}<figcaption>{legend}</figcaption></figure>"

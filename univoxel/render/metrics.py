@@ -147,7 +147,7 @@ def chamfer(points: Tensor, truth: Tensor) -> float:
         ValueError: a set is empty.
     """
     if not len(points) or not len(truth):
-        raise ValueError(f"chamfer: expected points, got {len(points)} and {len(truth)}")
+        raise ValueError(f"chamfer: both sets need points, got {len(points)} and {len(truth)}")
     a, b = points.double().numpy(), truth.double().numpy()
     there, _ = KDTree(b).query(a)
     back, _ = KDTree(a).query(b)

@@ -161,7 +161,7 @@ def traced_problem(
         scene.occluder()
         return build_problem(scene, photos, replace(cfg, points=points), seed)
     except NoSurface as error:  # there is none, or none that is seen
-        progress.trouble(f"stage {progress.clock.stage + 1}: {error}: kept light and materials")
+        progress.trouble(f"stage {progress.clock.stage + 1}: {error}: light and materials are kept")
         return None
 
 
