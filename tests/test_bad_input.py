@@ -162,10 +162,7 @@ def nan(tensor):
         (meta(lambda m: m["levels"].__setitem__(3, 3)), "rows must be a power of two"),
         (meta(lambda m: m["levels"].__setitem__(3, 2**40)), "expected field.features with"),
         (meta(lambda m: m["grid"].update(origin=None)), "origin must be tuple"),
-        (
-            meta(lambda m: m["grid"].update(size=[10**5] * 3)),
-            "size must be at least 2 along each axis",
-        ),
+        (meta(lambda m: m["grid"].update(size=[10**5] * 3)), "size must be at least 2 along"),
         (meta(lambda m: m["grid"].update(size=[1200] * 3)), "expected field.sdf"),
         (meta(lambda m: m.update(scene=[])), "do not match their description"),
         (meta(lambda m: m["scene"].update(hidden=10**5)), "expected material.net.0.weight with"),

@@ -388,7 +388,7 @@ def test_a_capture_of_version_0_2_is_gone_on_with(steps, pictures, tmp_path):
 
 
 def still(photographs, out, masks=None, config=None):
-    raise StillBackground("the background is static in 9 of 10 pairs")
+    raise StillBackground("the background is static in 9 of 10 pairs of photographs")
 
 
 def test_a_turntable_gets_masks_first(steps, pictures, tmp_path, monkeypatch, caplog):
@@ -518,6 +518,6 @@ def test_how_long_training_takes_is_said_before_cameras_are_found(
     with pytest.raises(DataError, match="no cameras"):
         task.capture(photographs[0], tmp_path / "out", masks=photographs[1], preset="draft")
     assert re.search(
-        r"training takes about \d+ (s|min) on this machine, after cameras and masks",
+        r"training takes about \d+ (s|min) on this machine, once cameras are found",
         caplog.text,
     )

@@ -137,7 +137,7 @@ def test_what_decides(photographs, monkeypatch, caplog, still_around, ahead, sav
     assert (found.turntable is not None) == turns
     assert found.flash is None
     if turns:
-        assert "a fixed light explains 0 %" in caplog.text
+        assert "a fixed light: 0 %" in caplog.text
 
 
 def test_what_is_known_is_not_looked_for(photographs):

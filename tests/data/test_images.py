@@ -298,9 +298,7 @@ def test_old_run_lengths(tmp_path):
     assert (found[301:] == torch.tensor([5, 4, 3]) * 2.0**-7).all()
     for body in (pixels[:-1], pixels[1:], [*pixels, pixels[0]]):
         (tmp_path / "a.hdr").write_bytes(head + bytes(np.ravel(body).tolist()))
-        with pytest.raises(
-            DataError, match=r"a\.hdr: expected 38x8 pixels, as 1216 uncompressed bytes"
-        ):
+        with pytest.raises(DataError, match=r"a\.hdr: expected 38x8 .* 1216 uncompressed bytes"):
             images.read_image(tmp_path / "a.hdr")
 
 

@@ -75,14 +75,8 @@ def other_size(folder):
         (frame(mask_path="masks/none.png"), r"frame 1: the mask .*masks/none\.png .*\(mask_path\)"),
         (frame(mask_path=7), "frame 1: the mask .*/7"),
         (root(test_filenames="p_000"), "expected a list of file_paths as test_filenames"),
-        (
-            root(test_filenames=[]),
-            "test_filenames to list only frames of this file, got an empty list",
-        ),
-        (
-            root(test_filenames=["x/y.png"]),
-            "test_filenames to list only frames of this file, got y",
-        ),
+        (root(test_filenames=[]), "to list only frames of this file, got an empty list"),
+        (root(test_filenames=["x/y.png"]), "expected test_filenames to list only .*, got y"),
         (other_size, r"masks/p_008\.png: expected 9x8 pixels, got 12x8"),
     ],
 )

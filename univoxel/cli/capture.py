@@ -190,7 +190,7 @@ def capture(
         if not (project.run / FILE).exists():
             seconds = slowdown(training) * sum(map(expected_seconds, training.stages))
             said = f"training takes about {duration(seconds)} on this machine"
-            log.info(f"{said}, after cameras and masks are made")
+            log.info(f"{said}, once cameras are found and masks are made")
         scene = _find_cameras(project, given, asked, config)
         data = _find_masks(project, scene, asked)
         run = _train(replace(training, data=data.absolute(), out=project.run), on_progress)

@@ -211,7 +211,7 @@ def light_frame_of(
     assert found is not None
     log.info(
         "light: it rotates with the camera, as on a turntable%s. This explains %.0f %% of the "
-        "colour changes between photographs, a fixed light %.0f %%; light_frame overrides this",
+        "colour changes between photographs (a fixed light: %.0f %%); light_frame overrides this",
         f" with {len(turntable.tables)} positions of the object" if turntable.others else "",
         100 * found.by_turning_light,
         100 * max(found.by_still_light, 0.0),  # none, where the other half contradicts it
