@@ -162,7 +162,7 @@ def nan(tensor):
         (meta(lambda m: m["levels"].__setitem__(3, 3)), "rows must be a power of two"),
         (meta(lambda m: m["levels"].__setitem__(3, 2**40)), "expected field.features with"),
         (meta(lambda m: m["grid"].update(origin=None)), "origin must be tuple"),
-        (meta(lambda m: m["grid"].update(size=[10**5] * 3)), "size must be 2 or more"),
+        (meta(lambda m: m["grid"].update(size=[10**5] * 3)), "size must be at least 2 along"),
         (meta(lambda m: m["grid"].update(size=[1200] * 3)), "expected field.sdf"),
         (meta(lambda m: m.update(scene=[])), "do not match their description"),
         (meta(lambda m: m["scene"].update(hidden=10**5)), "expected material.net.0.weight with"),
@@ -270,5 +270,5 @@ def test_the_template_is_sound(run, tmp_path):
         read_exr(out / "r_0.exr")
     )
     assert 0 <= json.loads((out / "a.json").read_text())["trust"]["albedo_error"] <= 1
-    assert "Expected error, mean over the surface" in (run / "trust.txt").read_text()
+    assert "Mean expected error of the surface" in (run / "trust.txt").read_text()
     assert read_image(run / "preview.png").shape == (16, 5 * 16, 3)

@@ -129,7 +129,7 @@ def test_capture_until_a_step(calls, capsys):
     assert capsys.readouterr().out == "mug/cut\n"
     assert calls.noted[0][2] == {"masks": "auto", "until": "masks", **USUAL}
     assert main(["capture", "photos", "--out", "mug", "--until", "cameras", "--minutes", "2"]) == 2
-    said = "--until cameras: --preset, --light, --minutes and --set have no effect"
+    said = "with --until cameras, leave out --preset, --light, --minutes and --set"
     assert said in capsys.readouterr().err
 
 
@@ -743,8 +743,8 @@ def test_help_does_not_wait_for_torch():
 @pytest.mark.parametrize(
     ("argument", "message"),
     [
-        ("", "expected arguments that are not empty, got ''"),
-        ("--out=", "expected arguments that are not empty, got '--out='"),
+        ("", "expected no empty arguments, got ''"),
+        ("--out=", "expected no empty arguments, got '--out='"),
         ("run\udcff", r"expected arguments in UTF-8, got b'run\xff'"),
     ],
 )

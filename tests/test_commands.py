@@ -22,5 +22,5 @@ def test_ground():
         "lowest",
         -0.5,
     )
-    with pytest.raises(ValueError, match="--ground: expected lowest or a height, got 'floor'"):
+    with pytest.raises(ValueError, match="expected a height or the word lowest, got 'floor'"):
         parse_ground("floor")

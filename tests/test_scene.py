@@ -202,7 +202,7 @@ def test_a_file_whose_field_has_other_channels_is_refused(tmp_path):
     levels = Levels.of(grid.bounds(), grid.voxel_size, 1 + scene.cfg.channels // 2)
     scene.field = hash_field(grid, levels, scene.field.sdf.detach())
     save_scene(scene, tmp_path, {})
-    with pytest.raises(ValueError, match=r"6 channels in the field, but 4 in the networks"):
+    with pytest.raises(ValueError, match="the field has 6 channels, the networks use 4"):
         load_scene(tmp_path)
 
 

@@ -23,7 +23,7 @@ def test_a_good_run():
 @pytest.mark.parametrize(
     ("name", "usable", "retake", "reason", "remedy"),
     [
-        ("psnr", 24.0, 15.0, "validation PSNR 24.0 dB", "photograph sharply"),
+        ("psnr", 24.0, 15.0, "validation PSNR 24.0 dB", "take sharp photographs"),
         ("outline", 0.05, 0.2, "5% of the outline", "correct the masks"),
         ("hidden", 0.4, 0.7, "40% of the surface is seen by too few", "more photographs"),
         ("residual", 0.3, 0.9, "30% of the surface differs", "--preset full"),
@@ -49,7 +49,7 @@ def test_the_worst_comes_first_and_two_remedies_are_enough():
     assert "90% of the surface" in found.reasons[0]
     assert len(found.reasons) == 4
     assert len(found.remedies) == 2
-    assert of(troubles=1).reasons == ("training had to recover once",)
+    assert of(troubles=1).reasons == ("training failed once and recovered",)
 
 
 def test_a_run_that_time_cut_is_unfinished():

@@ -49,10 +49,10 @@ class StageConfig:
 
     voxels: float = field(
         metadata=about(
-            "maximum number in the object's box; see voxel_pixels", unit="millions", above=0
+            "maximum number of voxels in the box; see voxel_pixels", unit="millions", above=0
         )
     )
-    iterations: int = field(metadata=about("optimisation steps; fewer if time runs out", least=1))
+    iterations: int = field(metadata=about("number of steps; fewer if time runs out", least=1))
     share: float = field(
         metadata=about("share of the remaining time, if there is a time limit", above=0, most=1)
     )
@@ -64,7 +64,7 @@ class StageConfig:
         (0.07, 0.005), "learning rate of the signed distances", unit="voxels per step", above=0
     )
     lr_features: tuple[float, float] = setting(
-        (0.1, 0.01), "learning rate of features and of the direction table", above=0
+        (0.1, 0.01), "learning rate of features and of the table of reflected directions", above=0
     )
     lr_networks: tuple[float, float] = setting(
         (6e-3, 3e-4), "learning rate of networks, light and per-view parameters", above=0
@@ -72,19 +72,19 @@ class StageConfig:
     plate: float = setting(
         0.003, "thin-plate smoothing of the updated sdf nodes, per step", least=0, most=0.125
     )
-    spread: int = setting(4, "smoothing passes over the sdf's gradient", least=0)
+    spread: int = setting(4, "number of smoothing passes over the gradient of the sdf", least=0)
     diffusion: float = setting(
         0.01, "smoothing of the updated feature nodes, per step", least=0, most=0.25
     )
     physical_from: float = setting(
-        0.3, "progress at which physically based rendering is added", least=0, most=1
+        0.3, "share of the steps after which physically based rendering is added", least=0, most=1
     )
     patches_from: float = setting(
-        0.0, "progress at which patches are compared between photographs", least=0, most=1
+        0.0, "share of the steps after which photographs are compared by patches", least=0, most=1
     )
     refit: bool = setting(False, "whether to freeze materials and fit light, radiance and shape")
     field: FieldName = setting(
-        "hash", "storage of features: every grid node, bricks at the surface, or a hash table"
+        "hash", "where features are stored: every grid node, bricks at the surface, or a hash table"
     )
 
     __post_init__ = check_settings
@@ -114,7 +114,7 @@ class EntropyConfig:
     """The prior that an object has few albedo colours, see training/albedo_entropy.py."""
 
     teaching_steps: int = setting(
-        60, "steps in which the material head learns new albedos after the map changes", least=1
+        60, "number of steps that teach the new albedos to the material head", least=1
     )
 
     __post_init__ = check_settings
@@ -126,9 +126,9 @@ class JointConfig:
 
     iterations: int = setting(675, "total number of Adam steps; fewer if time runs out", least=1)
     share: float = setting(0.27, "share of the time limit", above=0, most=1)
-    rays: int = setting(2048, "number of observations per step, at least views")
+    rays: int = setting(2048, "number of observations per step; at least as many as views")
     views: int = setting(4, "number of observations of each point per step", least=1)
-    rounds: int = setting(4, "number of rounds of Newton steps on the map and Adam steps", least=1)
+    rounds: int = setting(4, "number of rounds: Newton steps on the map, then Adam steps", least=1)
     points: int = setting(20400, "number of surface points", least=1)
     tracing: int = setting(2, "visibility rays per point and direction", least=1)
     colors: bool = setting(True, "whether to minimise the entropy of the albedo; see entropy")
@@ -143,13 +143,13 @@ class JointConfig:
     lr_sdf: float = setting(
         0.04, "learning rate of the surface; 0: frozen", unit="voxels per step", least=0
     )
-    newton_steps: int = setting(3, "Newton steps at the start of a round", least=0)
+    newton_steps: int = setting(3, "number of Newton steps at the start of a round", least=0)
     newton_points: int = setting(1900, "number of points in a Newton step", least=1)
-    newton_views: int = setting(8, "number of observations of each of newton_points", least=2)
+    newton_views: int = setting(8, "number of observations of each point in a Newton step", least=2)
     newton_smooth: float = setting(
         1e-7, "weight of the log map's Laplacian, relative to the mean squared residual", above=0
     )
-    entropy: EntropyConfig = setting(EntropyConfig(), "prior on few albedos, used with colors")
+    entropy: EntropyConfig = setting(EntropyConfig(), "prior that prefers few albedo colours")
 
     def __post_init__(self) -> None:
         check_settings(self)
@@ -169,10 +169,10 @@ class TrainConfig:
         None, "time limit, including preparation; stages are shortened equally to fit", above=0
     )
     downscale: int = setting(
-        0, "train at 1/N of the photographs' size; 0: no more pixels than grids can use", least=0
+        0, "train at 1/N of the photographs' size; 0: as large as the grids can use", least=0
     )
     voxel_pixels: float = setting(
-        1.0, "minimum width of a voxel in pixels of the photographs, at the object", least=0
+        1.0, "minimum width of a voxel at the object, in pixels of the photographs", least=0
     )
     seed: int = setting(0, "random seed; it does not change the validation pixels")
     masks: MasksFrom = setting("auto", "auto: erode masks that extend past the object's edge")
@@ -180,7 +180,7 @@ class TrainConfig:
         "auto", "refined: optimise camera poses; auto: only if silhouettes are inconsistent"
     )
     exposures: bool = setting(
-        True, "whether to look for differing exposures and light; the result sets scene.varying"
+        True, "whether to detect varying exposure and light; the result sets scene.varying"
     )
     allow_outside: bool = setting(
         False, "also read files outside the folder if the data set refers to them"
@@ -195,22 +195,22 @@ class TrainConfig:
     )
     carving_seconds: float = setting(
         12.0,
-        "maximum expected time of carving on two cores; 0 or varying light: no carving",
+        "carve unless that takes longer than this on two cores; 0 or varying light: never",
         unit="seconds",
         least=0,
     )
     patience: float = setting(
         0.0,
-        "end a stage early if validation PSNR rises by less than this in 15 % of it; 0: never",
+        "end a stage if validation PSNR rises by less than this in 15 % of its steps; 0: never",
         unit="dB",
         least=0,
     )
-    capacity: Capacity = setting("adaptive", "adaptive: shrink the model as validation allows")
+    capacity: Capacity = setting("adaptive", "adaptive: shrink the model if validation PSNR allows")
     budget_mb: float | None = setting(
         None, "maximum size of the model file; needs adaptive capacity", unit="1e6 bytes", above=0
     )
     scene: SceneConfig = setting(SceneConfig(), "sizes of the model, and its lighting model")
-    loss: LossConfig = setting(LossConfig(), "weights of the losses in each StageConfig")
+    loss: LossConfig = setting(LossConfig(), "weights of the losses in stages of type StageConfig")
 
     def __post_init__(self) -> None:
         check_settings(self)
@@ -221,7 +221,7 @@ class TrainConfig:
         kinds = [s.field for s in self.stages if isinstance(s, StageConfig)]
         if "hash" in kinds and set(kinds) != {"hash"}:
             raise ConfigError(
-                f"TrainConfig: either all stages or none must use hash, got {', '.join(kinds)}"
+                f"TrainConfig: all stages or none must use hash fields, got {', '.join(kinds)}"
             )
         if kinds != sorted(kinds):
             raise ConfigError(
@@ -315,7 +315,7 @@ def check_same(cfg: TrainConfig) -> None:
         if began.get(name) != now[name]:
             raise UserError(
                 f"{path}: the run was started with another {name}: to resume it, pass the same "
-                f"{', '.join(CHOICES[:-1])} and {CHOICES[-1]} as then",
+                f"{', '.join(CHOICES[:-1])} and {CHOICES[-1]} as before",
                 *CHOICES,
             )
 

@@ -107,7 +107,7 @@ def _source_of(run: Path) -> Source:
             # 0 in runs from before a size was chosen for large photographs: those were refused
             return Source(Path(data), downscale or 1, outside)
     raise DataError(
-        f"{path}: expected a folder as data and a number of at least 0 as downscale, got "
+        f"{path}: expected data to be a folder and downscale to be at least 0, got "
         f"{values.get('data')!r:.80} and {values.get('downscale')!r:.80}"
     )
 
@@ -190,7 +190,7 @@ def judge(evidence: Evidence) -> Verdict:
         GOOD_DB,
         POOR_DB,
         f"validation PSNR {{:.1f}} dB ({GOOD_DB:g} or more is good)",
-        "photograph sharply, with one exposure, and move neither object nor light",
+        "take sharp photographs with one exposure, and do not move the object or the light",
     )
     check(
         evidence.outline,
@@ -204,7 +204,7 @@ def judge(evidence: Evidence) -> Verdict:
         GOOD_HIDDEN,
         POOR_HIDDEN,
         "{:.0%} of the surface is seen by too few cameras",
-        "take more photographs (`univoxel report` shows from where)",
+        "take more photographs from the directions that `univoxel report` shows",
     )
     check(
         evidence.residual,
@@ -215,7 +215,7 @@ def judge(evidence: Evidence) -> Verdict:
     )
     if evidence.troubles:
         times = "once" if evidence.troubles == 1 else f"{evidence.troubles} times"
-        faults.append((False, f"training had to recover {times}", "try another `--seed`"))
+        faults.append((False, f"training failed {times} and recovered", "try another `--seed`"))
     faults.sort(key=lambda found: not found[0])
     word: Word = "good" if not faults else "retake" if faults[0][0] else "usable"
     reasons = [reason for _, reason, _ in faults]

@@ -45,17 +45,17 @@ class SceneConfig:
     )
     hidden: int = setting(64, "width of the material and radiance heads", least=1)
     mirror_levels: int = setting(5, "levels of the table of reflected directions", least=0, most=8)
-    sky_nodes: int = setting(512, "nodes of the environment map; 0: the scene has none", least=0)
+    sky_nodes: int = setting(512, "number of nodes of the environment map; 0: no map", least=0)
     sky_rows: int = setting(
         0,
-        "rows of environment map texels; used by runs of version 0.2 only",
+        "number of rows of the environment map; only runs of version 0.2 use this",
         least=0,
         most=MOST_ROWS,
     )
     mirrored: bool = setting(
         True, "whether local light has a specular network, for sharp reflections"
     )
-    light: lights.LightConfig = setting(lights.SGConfig(), "lighting model with its own sizes")
+    light: lights.LightConfig = setting(lights.SGConfig(), "lighting model and its sizes")
     roughness: float | None = setting(
         None,
         "known roughness of an object without metal; None: roughness and metallic are learned",
@@ -77,7 +77,7 @@ class SceneConfig:
         False, "whether camera poses are optimised, see PoseSteps; set by training"
     )
     views: tuple[str, ...] = setting(
-        (), "names of the photographs, if something changes between them; set by training"
+        (), "names of the photographs, if anything is learned for each one; set by training"
     )
 
     def __post_init__(self) -> None:
@@ -458,7 +458,7 @@ def _scene(about: Description, bricks: Bricks | None) -> Scene:
     field = Field(distances, encoding)
     if field.channels != about.scene.channels:
         raise ValueError(
-            f"{field.channels} channels in the field, but {about.scene.channels} in the networks"
+            f"the field has {field.channels} channels, the networks use {about.scene.channels}"
         )
     return Scene(about.scene, field, about.inv_s)
 
@@ -490,13 +490,13 @@ def _compare_rows(name: str, table: Tensor, rows: Tensor, values: Tensor) -> Non
     count = table.numel() // math.prod(channels)
     if rows.dtype != torch.int32 or list(values.shape) != [*rows.shape, *channels]:
         raise ValueError(
-            f"expected {name} as int32 rows with {channels} values each, got rows "
+            f"expected int32 rows of {name} with {channels} values each, got rows "
             f"{list(rows.shape)} {rows.dtype} and values {list(values.shape)}"
         )
     if count > ROWS_FOR_ONE * (len(rows) + ROWS_FOR_ONE):
         raise ValueError(f"expected {name} with {count} rows, got at most {len(rows)}")
     if len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < count:
-        raise ValueError(f"expected {name} with rows below {count}, got larger ones")
+        raise ValueError(f"expected {name} with rows in [0, {count}), got others")
 
 
 def _unpack_(scene: Scene, tensors: dict[str, Tensor]) -> None:

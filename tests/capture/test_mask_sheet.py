@@ -62,6 +62,6 @@ def test_the_page_needs_no_other_file(tmp_path):
     text = (tmp_path / "masks.html").read_text()
     assert text.count("data:image/jpeg;base64,") == 3
     assert "1 &amp; 2" in text
-    assert "&lt;a&gt;  0.50 misses part of the object; corrected on the right" in text
+    assert "&lt;a&gt;  0.50 misses part of the object; the corrected mask is on the right" in text
     assert text.count('class="wrong"') == 1
     assert text.index("&lt;a&gt;") < text.index(">b")

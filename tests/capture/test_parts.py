@@ -69,9 +69,8 @@ def test_one_lens_at_one_zoom_is_one_camera_held_either_way():
     groups = group(photographs)
     assert groups == [[0, 1, 6], [2, 5], [3], [4]]
     said = in_words(photographs, groups)
-    assert said == (
-        "7 photographs from 4 cameras (2 models, 2 zoom settings, 2 sizes), 1 of them portrait"
-    )
+    assert said.startswith("7 photographs from 4 cameras (2 models, 2 zoom settings, 2 sizes), ")
+    assert said.endswith("1 of them in portrait orientation")
     assert in_words(photographs[:1], [[0]]) == "1 photographs from Phone (40x30)"
 
 
@@ -131,10 +130,12 @@ def test_reasons_of_photographs_without_a_place():
     pairs = [(2, 3, 12, 2), (3, 4, 80, 2)]
     assert why_not(None, features, pairs, {}) == "no features that can be matched"
     assert why_not(1, features, pairs, {}) == "no features that can be matched"
-    assert why_not(2, features, pairs, {}) == "12 matches with its best partner; 15 are needed"
+    assert (
+        why_not(2, features, pairs, {}) == "at most 12 matches with one photograph; 15 are needed"
+    )
     assert why_not(3, features, pairs, {3: 4}).startswith("connected to 4 photographs")
     assert why_not(4, features, pairs, {}) == (
-        "80 matches with its best partner, which disagree with the others"
+        "80 matches with one photograph, but these contradict the other matches"
     )
 
 

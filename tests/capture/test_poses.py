@@ -337,7 +337,7 @@ def test_too_few_placed_is_one_line(photographs, tmp_path):
 def test_what_is_no_folder_of_photographs_is_one_line(tmp_path):
     with pytest.raises(DataError, match="expected a folder of photographs or a video"):
         poses(tmp_path / "none", tmp_path / "out")
-    with pytest.raises(DataError, match="every works only with videos"):
+    with pytest.raises(DataError, match="every applies only to videos"):
         poses(tmp_path, tmp_path / "out", every=1.0)
     for name in "ab":
         Image.new("RGB", (64, 48)).save(tmp_path / f"{name}.jpg")
@@ -367,7 +367,7 @@ def test_a_step_that_fails_or_hangs_is_stopped(tmp_path, monkeypatch):
         list(sfm.run(sfm.Request("match", "/", "/", "/"), log, lambda: 0))
     path = pycolmap_that("import time; time.sleep(60)", tmp_path)
     monkeypatch.setenv("PYTHONPATH", path)
-    with pytest.raises(ProcessFailed, match="was stopped after 0 s"):
+    with pytest.raises(ProcessFailed, match="took over 0 s and was stopped"):
         list(sfm.run(request, log, lambda: 0))
 
 

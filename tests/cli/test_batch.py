@@ -153,7 +153,7 @@ def test_what_is_done_is_not_done_again(night, scenes, monkeypatch, capsys):
 def test_another_training_is_refused(night, scenes, capsys):
     out, options = night
     assert main(["batch", str(scenes[0]), "--out", str(out), *options, "--set=seed=4"]) == 2
-    assert re.search(r"ball\.json has other values of changes: .*--out", capsys.readouterr().err)
+    assert re.search(r"ball\.json differs in changes from .*--out", capsys.readouterr().err)
 
 
 def test_a_scene_that_fails_takes_no_other_with_it(scenes, tmp_path, monkeypatch, capsys):
@@ -306,7 +306,7 @@ def test_mistakes_are_found_before_anything_is_begun(scenes, tmp_path, monkeypat
     other.mkdir(parents=True)
     refused(UserError, "folders with different names, got .*ball and .*ball", [scenes[0], other])
     (tmp_path / "logs").mkdir()
-    refused(UserError, "a scene cannot be named 'logs': rename the folder", [tmp_path / "logs"])
+    refused(UserError, "the name 'logs' is reserved: rename the folder", [tmp_path / "logs"])
     for name in ("jobs", "threads", "tries"):
         refused(UserError, f"{name} must be at least 1, got 0", **{name: 0})
     for field, value, match in (

@@ -200,9 +200,9 @@ def test_a_run_takes_the_place_of_three_steps(captured, tmp_path, caplog):
         *("again.glb", "steps.json", "index.html", "pictures")
     }
     assert f"step 3 of 6, training: already done, see {captured.run}" in caplog.text
-    with pytest.raises(UserError, match="is a trained run: masks, network, box, preset"):
+    with pytest.raises(UserError, match="is a trained run: leave out masks, network, box, preset"):
         task.capture(captured.run, tmp_path / "other", minutes=2.0)
-    with pytest.raises(UserError, match="is a trained run: masks"):
+    with pytest.raises(UserError, match="is a trained run: leave out masks"):
         task.capture(captured.run, tmp_path / "other", masks="none")
     with pytest.raises(UserError, match="until must be page, got masks"):
         task.capture(captured.run, tmp_path / "other", until="masks")
@@ -333,7 +333,7 @@ def test_another_box_makes_other_masks(steps, pictures, tmp_path, monkeypatch):
     task.find_data(pictures, out, masks="none", box=box, keep_table=True)
     assert steps[1:] == [("cutout", out / "scene", "none", box, True)]
     task.find_data(pictures, out, masks="none", box=list(box), keep_table=True)  # goes on
-    said = r"with masks=none, box=0.0 0.0 0.0 1.0 1.0 0.5, keep_table=True: to make it again"
+    said = r"with masks=none, box=0.0 0.0 0.0 1.0 1.0 0.5, keep_table=True: to make the masks again"
     with pytest.raises(ExistingFile, match=said):
         task.find_data(pictures, out, masks="none", box=box)
     scene = task.SCENE
@@ -388,7 +388,7 @@ def test_a_capture_of_version_0_2_is_gone_on_with(steps, pictures, tmp_path):
 
 
 def still(photographs, out, masks=None, config=None):
-    raise StillBackground("the background is static in 9 of 10 pairs")
+    raise StillBackground("the background is static in 9 of 10 pairs of photographs")
 
 
 def test_a_turntable_gets_masks_first(steps, pictures, tmp_path, monkeypatch, caplog):
@@ -401,7 +401,7 @@ def test_a_turntable_gets_masks_first(steps, pictures, tmp_path, monkeypatch, ca
     monkeypatch.setattr("univoxel.capture.masks.mask_network", red_is_the_object)
     with caplog.at_level(logging.INFO, "univoxel"):
         task.capture(pictures, out)
-    assert "9 of 10 pairs, as on a turntable: masks are made first" in caplog.text
+    assert "9 of 10 pairs of photographs, as on a turntable, so masks are made" in caplog.text
     assert steps == [
         ("poses", pictures, out / "masks"),
         ("cutout", out / "scene", out / "scene" / "masks"),
@@ -474,7 +474,7 @@ def test_what_cannot_be_begun_leaves_nothing(steps, pictures, tmp_path, monkeypa
             pictures,
             {"network": "u2net", "masks": "none"},
             UserError,
-            "network=u2net has no effect unless",
+            "network=u2net applies only to masks from rembg",
         ),
         (pictures, {"preset": "quick"}, UserError, "preset must be one of draft, fast, full, best"),
         (pictures, {"minutes": -1.0}, UserError, "minutes must be above 0"),
@@ -518,6 +518,6 @@ def test_how_long_training_takes_is_said_before_cameras_are_found(
     with pytest.raises(DataError, match="no cameras"):
         task.capture(photographs[0], tmp_path / "out", masks=photographs[1], preset="draft")
     assert re.search(
-        r"training takes about \d+ (s|min) on this machine, in addition to the time for cameras",
+        r"training takes about \d+ (s|min) on this machine, once cameras are found",
         caplog.text,
     )

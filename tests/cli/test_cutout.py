@@ -138,7 +138,7 @@ def test_masks_that_are_mostly_wrong_stay(tmp_path, with_masks, caplog):
     task.cutout(data, out, folder)
     said = [r for r in caplog.records if r.levelno == logging.WARNING]
     assert len(said) == 1
-    assert "no mask is corrected" in said[0].getMessage()
+    assert "no mask was corrected" in said[0].getMessage()
     assert "check masks.html" in said[0].getMessage()
     cut = load_photos(out)
     for view, mask in enumerate(masks):
@@ -205,7 +205,7 @@ def test_what_stands_out_in_depth(tmp_path, room, caplog):
     caplog.set_level("INFO", "univoxel")
     data, true = room
     cut = load_photos(task.cutout(data, tmp_path / "cut", "none"))
-    assert "masks: made from depth" in caplog.text
+    assert "masks were made from depth" in caplog.text
     agreed = [iou(cut.picture(view)[1], mask) for view, mask in enumerate(true)]
     assert np.mean(agreed) > 0.95
     assert min(agreed) > 0.93
@@ -228,7 +228,7 @@ def test_a_box_takes_the_table_out_of_all_masks(tmp_path, room, caplog):
     folder, box = write_masks(tmp_path / "masks", masks, photos.names), (-0.5, -0.5, 0.03)
     caplog.set_level("INFO", "univoxel")
     cut = load_photos(task.cutout(data, tmp_path / "cut", folder, box=(*box, 0.6, 0.5, 1.2)))
-    assert "the object was found from masks of 20 photographs, depth on " in caplog.text
+    assert "the object was found using masks of 20 photographs, the depth of " in caplog.text
     assert "% of its surface, the box; it extends from " in caplog.text
     agreed = [iou(cut.picture(view)[1], mask) for view, mask in enumerate(true)]
     assert np.mean(agreed) > 0.9
@@ -252,10 +252,10 @@ def test_in_depth_a_box_ends_the_table_that_is_kept(tmp_path, room):
     [
         (["--box", "0", "0", "0", "1", "1", "0"], "--box: expected X0 Y0 Z0 X1 Y1 Z1 with X0 < X1"),
         (["--box", "0", "0", "0", "1"], "--box"),
-        (["--keep-table", "--from", "none"], "--keep-table needs masks from depth (none)"),
+        (["--keep-table", "--from", "none"], "--keep-table needs a box that bounds the table"),
         (
             ["--from", "none", "--network", "u2net"],
-            "--network u2net has no effect unless a network makes the masks",
+            "--network u2net applies only to masks from rembg",
         ),
         (["--network", "u2"], "Expected one of ('u2netp', 'silueta'"),
     ],

@@ -291,7 +291,7 @@ def broken_relit(folders):
         (lambda f: (f.run / "config.json").unlink(), r"folder of a run, but it has no"),
         (
             lambda f: (f.run / "config.json").write_text("{}"),
-            "config.json: expected a folder as data",
+            "config.json: expected data to be a folder",
         ),
         (lambda f: (f.run / "config.json").write_text("{"), "config.json: .* JSON"),
         (

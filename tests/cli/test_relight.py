@@ -176,7 +176,7 @@ def test_test_views_come_from_the_data_of_the_run(run):
     with pytest.raises(DataError, match=r"a run, but it has no config\.json"):
         frames(run, cameras="test")
     (run / "run" / "config.json").write_text("{}")
-    with pytest.raises(DataError, match=r"config\.json: expected a folder as data"):
+    with pytest.raises(DataError, match=r"config\.json: expected data to be a folder"):
         frames(run, cameras="test")
     (run / "run" / "config.json").write_text(json.dumps({"data": str(run / "none")}))
     with pytest.raises(DataError, match="none"):
@@ -201,7 +201,7 @@ def test_test_views_come_from_the_data_of_the_run(run):
         ({"animation": ["avi"]}, ValueError, "animation must be gif or mp4, got 'avi'"),
         ({"cameras": "orbit 2", "elevation": 90.0}, ValueError, r"elevation must be in \(-90, 90"),
         ({"cameras": "orbit many"}, ValueError, "expected orbit, or orbit N"),
-        ({"cameras": "nowhere.json"}, DataError, r"nowhere\.json: expected a camera file"),
+        ({"cameras": "nowhere.json"}, DataError, r"nowhere\.json: this camera file does not exist"),
     ],
 )
 def test_bad_arguments(run, options, error, message):

@@ -88,7 +88,7 @@ TEXT = {
     ),
     "parameters": (
         edited("cameras.txt", lambda t: t.replace("SIMPLE_PINHOLE", "PINHOLE")),
-        r"cameras\.txt: this file .*: camera 3 has the wrong number of parameters, 3",
+        r"cameras\.txt: this file .*: camera 3: 3 parameters do not fit PINHOLE",
     ),
     "words": (
         edited("cameras.txt", lambda t: t.replace("11.0", "wide")),

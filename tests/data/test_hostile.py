@@ -211,7 +211,7 @@ def test_names_that_mean_another_folder(data, file_path, file, name):
     """Results are written under the names of views: `relight` wrote OUT.png beside OUT."""
     edit(data / "transforms.json", lambda r: r["frames"][1].update(file_path=file_path))
     (data / "images" / "p_008.png").rename(data / file)
-    message = f"frame 1: expected a name that can be a file name, got '{name}'"
+    message = f"frame 1: expected a name that is valid as a file name, got '{name}'"
     with pytest.raises(DataError, match=message):
         load_photos(data, "test")  # it is the first by name
     with pytest.raises(DataError, match=message):

@@ -63,7 +63,7 @@ def one(row, column, new):
         (one(1, 0, lambda x: x + 0.5), "row 1: expected a rigid transform_matrix"),
         (
             lambda f: [path.unlink() for path in (f / "images").iterdir()],
-            "poses_bounds.npy: expected images in .*images, images_2 or images_4 etc",
+            "poses_bounds.npy: expected images in .*images, images_2, images_4 or similar",
         ),
     ],
 )

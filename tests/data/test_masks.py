@@ -455,7 +455,7 @@ def test_colours_tell_what_masks_were_made_of(tmp_path, caplog, square, upright)
     assert torch.equal(photos.alpha > 127, red)
     assert photos.alpha.any()
     what = "the upright image" if upright else "the stored pixels"
-    assert f"8 photographs have an EXIF orientation: their masks seem to be made for {what}" in (
+    assert f"8 photographs have an EXIF orientation, and their masks seem to match {what}" in (
         caplog.text
     )
 

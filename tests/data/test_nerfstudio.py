@@ -74,9 +74,9 @@ def other_size(folder):
         (root(k1="x"), "frame 0: expected k1 between -inf and inf, got 'x'"),
         (frame(mask_path="masks/none.png"), r"frame 1: the mask .*masks/none\.png .*\(mask_path\)"),
         (frame(mask_path=7), "frame 1: the mask .*/7"),
-        (root(test_filenames="p_000"), "expected test_filenames as a list of file_paths"),
-        (root(test_filenames=[]), "frames of this file in test_filenames, got an empty list"),
-        (root(test_filenames=["x/y.png"]), "frames of this file in test_filenames, got y"),
+        (root(test_filenames="p_000"), "expected a list of file_paths as test_filenames"),
+        (root(test_filenames=[]), "to list only frames of this file, got an empty list"),
+        (root(test_filenames=["x/y.png"]), "expected test_filenames to list only .*, got y"),
         (other_size, r"masks/p_008\.png: expected 9x8 pixels, got 12x8"),
     ],
 )

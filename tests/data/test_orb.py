@@ -71,7 +71,7 @@ def test_views_of_other_scenes(tmp_path):
 def test_other_scenes_lie_beside_the_scene(tmp_path, name):
     folder = write_orb(tmp_path)
     write_novel(folder, "x", scene_name=name)
-    with pytest.raises(DataError, match="frame 0: expected scene_name as the name of a folder"):
+    with pytest.raises(DataError, match="frame 0: expected the name of a folder as scene_name"):
         load_photos(folder, "novel", allow_outside=True)
 
 

@@ -77,7 +77,7 @@ def only_a_head(folder):
         (value(8, "3"), "line 5: expected cx between -12 and 24, got 42.0"),
         (value(12, "far"), "line 5: expected a number as k3, got 'far'"),
         (value(10, "0,0"), "line 5: expected 16 values, got 17"),
-        (only_a_head, "cameras.csv: expected a line per camera, got none"),
+        (only_a_head, "cameras.csv: expected a line for each camera, got none"),
         (
             lambda f: (f / "cameras.csv").write_bytes(SHORT.encode() + b"\n\xff"),
             "cameras.csv: expected text in UTF-8",

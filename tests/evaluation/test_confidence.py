@@ -198,12 +198,12 @@ def test_words_leave_out_what_is_not_the_case(surveyed):
     still = replace(surveyed, disagreement=agreeing, views=views)
     figures = numbers(still)
     said = words(figures, [])
-    assert said.startswith("Expected error, mean over the surface: 0.")
+    assert said.startswith("Mean expected error of the surface: 0.")
     for name in GOOD:
         assert f"On {figures[f'{name}_good']:.0%} of the surface, the {name} is good" in said
     assert "cameras" not in said
     assert "differs" not in said
-    assert "Photographs cannot separate the brightness" in said
+    assert "Photographs cannot tell a bright albedo" in said
     assert "trouble" not in said
     assert "recovered: 2. The last one: stage 1: b." in words(figures, ["a", "stage 1: b"])
 

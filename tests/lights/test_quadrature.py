@@ -138,5 +138,5 @@ def test_an_occlusion_of_another_size(change, message):
     seen = Occlusion(torch.zeros(5), torch.ones(5, 64), torch.zeros(5, 64, 3))
     with pytest.raises(ValueError, match=message):
         quadrature.reflected(Ramp(0.0), s, s.normal, 64, replace(seen, **change))
-    with pytest.raises(ValueError, match="expected an occlusion or a generator, but not both"):
+    with pytest.raises(ValueError, match="expected either an occlusion or a generator, got both"):
         quadrature.reflected(Ramp(0.0), s, s.normal, 64, seen, torch.Generator())

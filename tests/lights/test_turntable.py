@@ -157,5 +157,5 @@ def test_axis_and_start_are_across():
     with pytest.raises(ConfigError, match="axis and start must be perpendicular"):
         Turntable((0.0, 0.0, 0.0), (0.0, 0.0, 2.0), (1.0, 0.0, 0.0))
     one = (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
-    with pytest.raises(ConfigError, match="with several axes, each must have eyes"):
+    with pytest.raises(ConfigError, match="each needs camera positions"):
         Turntable(*one, others=(Table(*one, eyes=((1.0, 0.0, 0.0),)),))

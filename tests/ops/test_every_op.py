@@ -190,14 +190,14 @@ REFUSED = {
     ],
     "sample_dense": [
         *PLACE,
-        ({"sdf": torch.rand(4, 0, 6), "features": torch.rand(4, 0, 6, 2)}, "sdf must have nodes"),
+        ({"sdf": torch.rand(4, 0, 6), "features": torch.rand(4, 0, 6, 2)}, "sdf must not be empty"),
     ],
     "sample_sparse": [
         *PLACE,
         ({"bricks": None}, "bricks must be of the type Bricks, got NoneType"),
         (
             {"bricks": EMPTY, "sdf": torch.rand(256), "features": torch.rand(256, 2)},
-            r"bricks must have nodes, got size \[0, 4, 4\]",
+            r"bricks must not be empty, got size \[0, 4, 4\]",
         ),
     ],
     "encode_hash": [
@@ -212,7 +212,7 @@ REFUSED = {
         ({"felt": -1}, "felt must be at least 0, got -1"),
     ],
     "composite_field": [
-        ({"sdf": torch.rand(0, 8, 9), "features": torch.rand(0, 8, 9, 2)}, "sdf must have nodes"),
+        ({"sdf": torch.rand(0, 8, 9), "features": torch.rand(0, 8, 9, 2)}, "sdf must not be empty"),
         ({"inv_s": 0.0}, "inv_s must be positive and finite, got 0.0"),
         ({"min_share": 1.0}, r"min_share must be in \[0, 1\), got 1.0"),
         ({"voxel_size": -1.0}, "voxel_size must be above 0"),
@@ -319,7 +319,7 @@ REFUSED = {
     "sum_rows": [
         ({"rows": [], "values": []}, "at least one"),
         ({"rows": [torch.tensor([1, 2])]}, "as many rows as values"),
-        *(({"rows": [torch.tensor(x)], "values": [torch.ones(2, 3)]}, "rows must ascend in")
+        *(({"rows": [torch.tensor(x)], "values": [torch.ones(2, 3)]}, "rows must be in ascending")
           for x in ([5, 5], [5, 4], [-1, 3], [3, 12])),
         *(({"shape": x}, "every size in shape must be at least 1") for x in ((), (4, 0))),
     ],
@@ -451,7 +451,7 @@ def test_forward_mode_raises(case):
             op(*map(forward_ad.make_dual, given, tangents))
 
     for ask in (lambda: torch.func.jvp(op, tuple(given), tuple(tangents)), dual):
-        with pytest.raises(NotImplementedError, match="no derivative in forward mode"):
+        with pytest.raises(NotImplementedError, match="forward mode"):
             ask()
 
 

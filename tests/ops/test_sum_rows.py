@@ -42,5 +42,5 @@ def test_it_is_the_sum_of_sparse_tensors():
 
 @pytest.mark.parametrize("row", [[5, 5], [5, 4], [-1, 3], [3, 10]])
 def test_the_reference_refuses_rows_that_do_not_ascend_in_the_table(row):
-    with pytest.raises(ValueError, match=r"rows must ascend in \[0, 10\)"):
+    with pytest.raises(ValueError, match=r"rows must be in ascending order in \[0, 10\)"):
         sum_rows_reference([torch.tensor(row)], [torch.ones(2, 3)], [10])

@@ -131,7 +131,7 @@ def test_photographs_stand_beside_their_render_the_worst_first(run, text):
 
 def test_expected_errors_are_painted_and_told(text):
     said = section(text, "Expected errors")
-    assert "Expected error, mean over the surface: 0." in said
+    assert "Mean expected error of the surface: 0." in said
     names = [name for name, _ in pictures(said)]
     assert names == ["front", "right", "back", "left"]
 
@@ -267,7 +267,7 @@ def test_a_run_whose_photographs_are_gone_shows_what_is_left(run, data, tmp_path
         report_text(moved, scene, state, ReportOptions(data=tmp_path / "gone"))
     (moved / "config.json").write_text("{")
     text = report_text(moved, scene, state, ReportOptions(size=SIZE))
-    assert "The stages are missing" in text
+    assert "The table of stages is missing" in text
 
 
 def test_metal_is_a_layer_where_there_is_any(tmp_path):

@@ -99,5 +99,5 @@ def test_what_cannot_be_closed_is_reported():
     wing = Mesh(torch.cat([CORNERS, CORNERS[1:2] + 1]), torch.tensor([[0, 1, 4]]).int())
     three = joined(Mesh(CORNERS, TETRAHEDRON), wing)
     edge = torch.tensor([[0, 1, 8], [1, 0, 8], [0, 1, 8]], dtype=torch.int32)
-    with pytest.raises(ValueError, match=r"cannot be made watertight: \d+ edges do not join"):
+    with pytest.raises(ValueError, match=r"cannot be closed: \d+ edges do not join"):
         close(Mesh(three.vertices, torch.cat([TETRAHEDRON, edge])))

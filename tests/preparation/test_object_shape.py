@@ -88,7 +88,7 @@ def test_pixels_that_see_a_box():
 
 def test_masks_that_show_nothing():
     cameras = cameras_around(12, 32)
-    with pytest.raises(UserError, match="overlap in no part"):
+    with pytest.raises(UserError, match="do not overlap anywhere"):
         find_object([torch.zeros(32, 32)] * 12, without_depth(cameras), VOXELS)
 
 

@@ -111,7 +111,7 @@ def test_jagged_edges_are_not_doubted():
 
 def test_silhouettes_in_which_nothing_lies(photos, tmp_path):
     cfg = preset("fast", tmp_path / "data", tmp_path / "run")
-    with pytest.raises(DataError, match=r"data: .*(have no common volume|overlap in no part)"):
+    with pytest.raises(DataError, match=r"data: .*(have no common volume|do not overlap anywhere)"):
         prepare.find_silhouettes(replace(photos, alpha=torch.zeros_like(photos.alpha)), cfg)
 
 

@@ -146,7 +146,7 @@ def test_samples_are_uniform_over_the_area():
 
 def test_samples_of_no_area():
     mesh = Mesh(torch.zeros(3, 3), torch.tensor([[0, 1, 2]], dtype=torch.int32))
-    with pytest.raises(ValueError, match="a mesh with area, got 1 triangles"):
+    with pytest.raises(ValueError, match="a mesh with area > 0, got 1 triangles"):
         metrics.sample_mesh(mesh, 10, torch.Generator())
     with pytest.raises(ValueError, match="got 0 triangles"):
         metrics.sample_mesh(

@@ -77,9 +77,9 @@ def test_one_bad_step_is_dropped(data, tmp_path, monkeypatch, caplog, how):
     assert finite(load_scene(out))
     (told,) = events(out)
     what = "the loss is nan" if how is bad_loss else "a gradient is not finite"
-    assert told.startswith(f"stage 1, step 7: {what}; dropped this step, step size multiplied")
+    assert told.startswith(f"stage 1, step 7: {what}; dropped this step; the step size was")
     assert told in caplog.messages
-    assert "training had to recover once" in caplog.text
+    assert "training failed once and recovered" in caplog.text
 
 
 def test_a_failure_that_stays_ends_its_stage(data, tmp_path, monkeypatch):
@@ -237,7 +237,7 @@ def test_quality_of_another_kind_is_no_collapse(followed):
     watch.judge(25.0, False)
     assert not steps.troubles
     watch.judge(18.0, False)
-    assert "validation PSNR is 18.0 dB, 25.0 dB at best" in steps.troubles[0]
+    assert "validation PSNR is 18.0 dB (best: 25.0 dB)" in steps.troubles[0]
 
 
 def test_quality_beyond_need_may_fall(followed):
@@ -246,7 +246,7 @@ def test_quality_beyond_need_may_fall(followed):
         watch.judge(psnr, False)
     assert not steps.troubles
     watch.judge(float("nan"), False)
-    assert "validation PSNR is nan dB, 40.0 dB at best" in steps.troubles[0]
+    assert "validation PSNR is nan dB (best: 40.0 dB)" in steps.troubles[0]
 
 
 def test_a_copy_of_another_grid_is_not_taken(followed):
@@ -269,7 +269,7 @@ def test_a_copy_that_is_forgotten_is_not_taken(followed):
     watch.forget()
     watch.judge(1.0, False)
     assert number.item() == before
-    assert "there is no earlier state" in steps.troubles[0]
+    assert "found no earlier state" in steps.troubles[0]
 
 
 def test_a_system_is_damped_only_as_it_needs():

@@ -150,7 +150,7 @@ def test_a_training_is_ended_from_a_browser(data, tmp_path, looking, caplog):
     assert state["made"][0] < 0.5
     assert state["made"][1:] == [1.0, 1.0]
     assert len(scene.field.isosurface()[0]) > 100
-    assert "Expected error, mean over the surface" in (run / "trust.txt").read_text()
+    assert "Mean expected error of the surface" in (run / "trust.txt").read_text()
     assert "Result: unfinished, training was stopped (completed steps:" in caplog.text
 
 

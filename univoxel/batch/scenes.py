@@ -45,7 +45,7 @@ def named(scenes: Sequence[Path]) -> dict[str, Path]:
         if not path.exists():
             raise UserError(f"{path}: expected a scene, but the folder does not exist")
         if name == LOGS or name.startswith("."):
-            raise UserError(f"{path}: a scene cannot be named {name!r}: rename the folder")
+            raise UserError(f"{path}: the name {name!r} is reserved: rename the folder")
         if name in found:
             both = f"{found[name]} and {path}"
             raise UserError(f"expected scene folders with different names, got {both}")

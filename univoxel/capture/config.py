@@ -17,7 +17,7 @@ class CaptureConfig:
     """
 
     size: int = setting(
-        FEATURE_SIZE, "longer side at which features are detected", unit="pixels", least=64
+        FEATURE_SIZE, "longer side of images in which to find features", unit="pixels", least=64
     )
     features: int = setting(4096, "maximum number of features per photograph", least=64)
     first_octave: int = setting(
@@ -29,7 +29,7 @@ class CaptureConfig:
     seed: int = setting(0, "random seed", least=0)
     exhaustive: int = setting(
         24,
-        "up to this number of photographs, match all pairs; of more, match only similar pairs",
+        "maximum number of photographs to match in all pairs; of more, match only similar pairs",
         least=2,
     )
     partners: int = setting(16, "number of similar photographs to match with each one", least=1)

@@ -118,7 +118,7 @@ def write_page(path: Path, tiles: Sequence[MaskTile], about: str) -> None:
         words = escape(f"{tile.name}{_number(tile)} {tile.fault}")
         images = [image(picture) for picture in (tile.before, tile.after) if picture is not None]
         kind = ' class="wrong"' if tile.fault else ""
-        repaired = "" if tile.after is None else "; corrected on the right"
+        repaired = "" if tile.after is None else "; the corrected mask is on the right"
         caption = f"<figcaption>{words}{repaired}</figcaption>"
         figures.append(f"<figure{kind}>{''.join(images)}{caption}</figure>")
     main = "\n".join(["<main>", *figures, "</main>"])
@@ -219,8 +219,8 @@ def check_masks(origin: str, network: str, box: Sequence[float] | None, keep_tab
     check_network(network)
     if network != NETWORK and origin not in (REMBG, "auto"):
         raise UserError(
-            f"network={network} has no effect unless a network makes the masks: expected masks "
-            f"from {REMBG}, got {origin}",
+            f"network={network} applies only to masks from {REMBG}, but the source of the masks is "
+            f"{origin}",
             "network",
         )
     if box is not None:
@@ -228,8 +228,8 @@ def check_masks(origin: str, network: str, box: Sequence[float] | None, keep_tab
     if keep_table and (box is None or origin != DEPTH):
         got = "no box" if box is None else f"masks from {origin}"
         raise UserError(
-            f"keep_table needs masks from depth ({DEPTH}) and a box that bounds the table, got "
-            f"{got}",
+            f"keep_table needs a box that bounds the table, and masks from depth ({DEPTH}), "
+            f"got {got}",
             "keep_table",
         )
 
@@ -245,12 +245,12 @@ def _from_depth(
     if shape is None or shape.surface < GUESSED:
         raise DataError(
             f"{splits['train'].folder}: depth does not separate the object from its surroundings. "
-            f"Depth needs texture and cameras all around the object; otherwise, use source={REMBG} "
-            f"or a folder of masks instead of {DEPTH}",
+            f"Depth needs a textured object and cameras all around it. If you do not have these, "
+            f"use source={REMBG} or a folder of masks instead of {DEPTH}",
             "source",
         )
     _tell_evidence(shape, 0, box)
-    log.info("masks: made from depth; check masks.html")
+    log.info("masks were made from depth: check masks.html")
     return {name: _silhouettes_of(shape, split) for name, split in splits.items()}
 
 
@@ -271,12 +271,12 @@ def _within(splits: dict[str, Photos], masks: Masks, box: Tensor) -> Masks:
 def _tell_evidence(shape: object_shape.ObjectShape, count: int, box: Tensor | None) -> None:
     """Log what the object was told by, masks of so many photographs among it, and where it is."""
     by = [f"masks of {count} photographs"] if count else []
-    by += [f"depth on {shape.surface:.0%} of its surface"]
+    by += [f"the depth of {shape.surface:.0%} of its surface"]
     by += [] if box is None else ["the box"]
     lower, upper = (
         object_shape.words_of(corner.tolist()) for corner in object_shape.inside_bounds(shape)
     )
-    log.info(f"the object was found from {', '.join(by)}; it extends from {lower} to {upper}")
+    log.info(f"the object was found using {', '.join(by)}; it extends from {lower} to {upper}")
 
 
 def _silhouettes_of(shape: object_shape.ObjectShape, photos: Photos) -> list[Tensor]:
@@ -330,7 +330,7 @@ def _judged(
             "masks are not checked, because that needs %d photographs and there are only %d",
             *(PHOTOGRAPHS, count),
         )
-        return _as_they_are(masks), "too few photographs to check the masks: they are unchanged"
+        return _as_they_are(masks), "the masks are unchecked: there are too few photographs"
     coverage = {name: [m.float() / 255 for m in those] for name, those in masks.items()}
     shape = object_shape.find_object(coverage["train"], depth_maps(train), box=box)
     _tell_evidence(shape, count, box)
@@ -357,9 +357,9 @@ def _judged(
     wrong = sum(bool(v.fault) and (box is None or v.fault == MISSING) for v in verdicts["train"])
     told = _told(splits, verdicts, usual)
     if 2 * wrong > count and shape.surface < SURE:
-        told += ": no mask is corrected, because the shape may be wrong instead"
+        told += "; no mask was corrected, because the estimated shape may be wrong"
         log.warning(
-            f"{told}. Either all masks have the same fault or the cameras are wrong: check "
+            f"{told}. Perhaps all masks have the same fault, or the cameras are wrong: check "
             "masks.html"
         )
         for name, those in verdicts.items():
@@ -367,7 +367,7 @@ def _judged(
             verdicts[name] = [replace(verdict, mask=one) for verdict, one in kept]
         return verdicts, told
     if any(v.fault for those in verdicts.values() for v in those):
-        told += ": corrected from the other photographs; check masks.html"
+        told += "; these were corrected from the other photographs, so check masks.html"
     log.info(told)
     return verdicts, told
 

@@ -109,7 +109,7 @@ def find_photographs(folder: Path) -> tuple[list[Path], list[str], int]:
     where = ", ".join(str(p.relative_to(folder)) for p in inner[:NAMED])
     raise DataError(
         f"{folder}: expected photographs ({' '.join((*PLAIN, *HEIF))} or RAW), got none"
-        + (f", but {where} has some: pass that folder, or put all into one folder" if inner else "")
+        + (f", but {where} has some: pass it, or move all into one folder" if inner else "")
     )
 
 

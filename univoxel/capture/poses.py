@@ -121,7 +121,7 @@ def poses(
         model = scene.own_sizes(Model(model.cameras, ordered, model.points), capture, keep_size)
         model, known = scene.gauge_aligned(model)
         if not known:
-            log.warning("the world may be tilted: the cameras do not show what is up")
+            log.warning("the world may be tilted: the cameras do not show which way is up")
         names = [image.name for image in model.images]
         centres = np.stack([image.centre for image in model.images])
         for gap in gaps(centres, names, GAP):
@@ -185,7 +185,7 @@ def photographs_of(
         return sorted(folders.frames.glob("*.jpg")), [], 0
     if every is not None:
         raise DataError(
-            f"{source}: every works only with videos ({' '.join(photographs.SUFFIXES)})", "every"
+            f"{source}: every applies only to videos ({' '.join(photographs.SUFFIXES)})", "every"
         )
     if not source.is_dir():
         raise DataError(f"{source}: expected a folder of photographs or a video")
@@ -254,10 +254,10 @@ def _search(
     do(MATCHES, structure.match, structure.pair_count(folders))
     still, matching = pose_validation.still(database.verified_pairs(folders.database))
     if still > STILL_SHARE * matching:
-        stands = f"the background is static in {still} of {matching} pairs"
+        stands = f"the background is static in {still} of {matching} pairs of photographs"
         if capture.masks is None:
             raise StillBackground(stands)
-        raise DataError(f"{stands}, and masks include part of it: make the masks tighter", "masks")
+        raise DataError(f"{stands}, and the masks include part of it: tighten the masks", "masks")
     do(MODELS, structure.place, total)
     return unreadable
 
@@ -299,8 +299,8 @@ def _judge(capture: Capture, folders: Folders, unreadable: dict[int, str]) -> Fo
     if len(placed) < PLACED_SHARE * len(reports):
         missing = [f"{r.name} ({r.reason})" for r in reports if not r.placed]
         raise DataError(
-            f"only {len(placed)} of {len(reports)} photographs were registered. Take more, "
-            f"closer together, and do not move the object. Not registered: {_some(missing)}"
+            f"only {len(placed)} of {len(reports)} photographs were registered. Take more, with "
+            f"more overlap, and do not move the object. Not registered: {_some(missing)}"
         )
     return Found(models[0], weak, reports)
 
@@ -321,8 +321,8 @@ def _say(capture: Capture, found: Found, total: int, keep_weak: bool) -> None:
     shares = [f"{lens.focal[0] / lens.width:.2f}" for lens in lenses[:NAMED]]
     cameras = "one camera" if len(lenses) == 1 else f"{len(lenses)} cameras"
     log.info(
-        f"cameras: {len(model.images)} of {total} registered, mean reprojection error "
-        f"{model.error:.2f} pixels, focal length {', '.join(shares)} x width ({cameras})"
+        f"cameras: {len(model.images)} of {total} photographs registered, mean reprojection error "
+        f"{model.error:.2f} pixels, focal length {', '.join(shares)} times the width ({cameras})"
     )
     missing = [f"{r.name} ({r.reason})" for r in reports if not r.placed]
     if missing:
@@ -336,8 +336,8 @@ def _say(capture: Capture, found: Found, total: int, keep_weak: bool) -> None:
     if weak:
         fate = "kept" if keep_weak else "left out (keep_weak keeps them)"
         log.warning(
-            f"{len(weak)} photographs, whose poses may be wrong by several degrees, are {fate}: "
-            f"{_some(weak)}. Photograph that side again with more overlap",
+            f"{len(weak)} photographs may have poses that are wrong by several degrees. They are "
+            f"{fate}: {_some(weak)}. Photograph that side of the object again with more overlap",
             extra={"arguments": ("keep_weak",)},
         )
 

@@ -102,7 +102,7 @@ def in_words(photographs: Sequence[Photograph], groups: Sequence[Sequence[int]])
         ]
         told += f" from {len(groups)} cameras ({', '.join(of)})"
     if 0 < portrait < len(photographs):
-        told += f", {portrait} of them portrait"
+        told += f", {portrait} of them in portrait orientation"
     return told
 
 

@@ -255,7 +255,7 @@ def unusable(arguments: Sequence[str]) -> str | None:
     """
     for argument in arguments:
         if not argument or re.fullmatch(r"--[\w-]+=", argument):
-            return f"expected arguments that are not empty, got {argument!r}"
+            return f"expected no empty arguments, got {argument!r}"
         try:
             argument.encode()
         except UnicodeEncodeError:

@@ -28,7 +28,7 @@ EACH = ("steps", "masks", "preset", "light", "minutes", "config", "changes", "sa
 @dataclass(frozen=True, kw_only=True)
 class BatchOptions:
     scenes: parsing.Scenes
-    """folders of photographs with different names"""
+    """folders of photographs, one for each scene; their names must differ"""
     out: Annotated[Path, parsing.written("NIGHT")]
     """folder to write to"""
     steps: Annotated[tuple[choices.BatchStep, ...], parsing.written("STEP [STEP ...]")] = (
@@ -36,27 +36,27 @@ class BatchOptions:
     )
     """steps to run for each scene, in this order: poses masks train eval export page"""
     masks: Annotated[str, parsing.written("auto|rembg|FOLDER|none")] = "auto"
-    """source of the masks for the step masks, as in capture --masks"""
+    """source of the masks in the masks step, as for capture --masks"""
     preset: choices.PresetOrAuto = "auto"
-    """amount of work, from draft to best; auto: chosen to fit --minutes, else fast"""
+    """amount of work, from draft to best; auto: to fit --minutes, or fast without it"""
     light: Annotated[choices.LightName, parsing.ADVANCED] = "hybrid"
     """lighting model; hybrid keeps shadows out of the albedo; the others are baselines"""
     minutes: parsing.Minutes = None
     """time limit for training each scene"""
     config: parsing.ConfigFile = None
-    """reuse the config.json of another run in place of --preset and --light"""
+    """reuse the config.json of another run instead of --preset and --light"""
     changes: parsing.Changes = ()
     """change one configuration field, such as loss.radiance=0.5; repeatable"""
     samples: Annotated[int, parsing.ADVANCED] = choices.SAMPLES
-    """light samples per pixel of relit test images"""
+    """number of light samples per pixel in relit test images"""
     jobs: Annotated[int | None, parsing.written("N", "as cores and memory allow")] = None
-    """number of scenes at a time; each uses --threads threads or its share of cores"""
+    """number of scenes to process at a time, each with --threads or a share of cores"""
     scheduler: parsing.Scheduler = None
     """Dask scheduler to use; anyone who can reach it can run code on its workers"""
     tries: Annotated[int, parsing.ADVANCED] = 3
     """number of attempts at a scene whose process is killed"""
     json: parsing.JsonFile = None
-    """also write the content of batch.json to a file; - prints it, not the table"""
+    """also write batch.json to this file; - prints it instead of the table"""
 
     def training(self) -> TrainConfig:
         """The configuration of a training; a UserError if there is none of that kind."""

@@ -40,19 +40,19 @@ STEPS = ("cameras", "masks", "training", "mesh", "pictures", "page")
 @dataclass(frozen=True)
 class CaptureOptions:
     photographs: Annotated[Path, written("PHOTOS", positional=True)]
-    """folder of photographs, video, data set with cameras, or folder of a trained run"""
+    """folder of photographs, a video, a data set with cameras, or a trained run"""
     out: Annotated[Path, written("DIR")]
-    """folder to write scene/, cut/, run/, pictures/, the mesh and the page to"""
+    """output folder, for scene/, cut/, run/, pictures/, the mesh and the page"""
     masks: Annotated[str, written("auto|rembg|FOLDER|none")] = AUTO
     """source of the masks; auto: masks in PHOTOS, else a network, else depth only"""
     network: Annotated[choices.NetworkName, ADVANCED] = choices.NETWORK
-    """network that makes the masks; later ones are larger, slower and more accurate"""
+    """network that makes the masks; those listed later are slower but more accurate"""
     box: BoxOf = None
     """corners of a box around the object, in the world of scene/"""
     keep_table: Annotated[bool, ADVANCED] = False
-    """keep the table inside the box; needs --masks none"""
+    """keep the part of the table that is inside the box; needs --masks none"""
     preset: choices.PresetOrAuto = "auto"
-    """amount of work, from draft to best; auto: chosen to fit --minutes, else fast"""
+    """amount of work, from draft to best; auto: to fit --minutes, or fast without it"""
     light: Annotated[choices.LightName, ADVANCED] = "hybrid"
     """lighting model; hybrid keeps shadows out of the albedo; the others are baselines"""
     minutes: Minutes = None
@@ -60,7 +60,7 @@ class CaptureOptions:
     changes: Changes = ()
     """change one configuration field, such as loss.radiance=0.5; repeatable"""
     until: choices.Until = "page"
-    """last step to run; cameras, masks: stop before training and print the folder"""
+    """last step to run; cameras and masks stop before training and print the folder"""
 
     @property
     def fingerprint(self) -> Any:
@@ -97,7 +97,7 @@ def command(asked: CaptureOptions) -> int:
         print(made.mesh)
         return code_of(made.run)
     if (*training.values(), asked.changes) != ("auto", "hybrid", None, ()):
-        raise UserError(f"--until {until}: --preset, --light, --minutes and --set have no effect")
+        raise UserError(f"with --until {until}, leave out --preset, --light, --minutes and --set")
     print(find_data(*where, **masks, until=until))
     return 0
 
@@ -106,7 +106,7 @@ def command(asked: CaptureOptions) -> int:
 class PicturesConfig:
     """The pictures of a capture."""
 
-    frames: int = setting(8, "frames of an orbit, for each environment map", least=1)
+    frames: int = setting(8, "number of frames of the orbit under each environment map", least=1)
     resolution: int = setting(512, "width and height of the images", unit="pixels", least=1)
     samples: int = setting(choices.SAMPLES, "light samples per pixel", least=1)
 
@@ -190,7 +190,7 @@ def capture(
         if not (project.run / FILE).exists():
             seconds = slowdown(training) * sum(map(expected_seconds, training.stages))
             said = f"training takes about {duration(seconds)} on this machine"
-            log.info(f"{said}, in addition to the time for cameras and masks")
+            log.info(f"{said}, once cameras are found and masks are made")
         scene = _find_cameras(project, given, asked, config)
         data = _find_masks(project, scene, asked)
         run = _train(replace(training, data=data.absolute(), out=project.run), on_progress)
@@ -241,8 +241,8 @@ def _check_unused(given: Given, asked: CaptureOptions, training: TrainConfig) ->
     usual = chosen("auto", None, training.data, training.out)
     if asked.fingerprint != AUTO or training != usual:
         raise UserError(
-            f"{given.path} is a trained run: masks, network, box, preset, minutes, light and set "
-            "have no effect on it",
+            f"{given.path} is a trained run: leave out masks, network, box, preset, minutes, "
+            "light and set, which would have no effect",
             *("masks", "network", "box", "preset", "minutes", "light", "set"),
         )
 
@@ -305,10 +305,10 @@ def _find_cameras(
         try:
             return poses(given.path, done, config=config)
         except StillBackground as error:
-            log.info(f"{error.seen}, as on a turntable: masks are made first")
+            log.info(f"{error.seen}, as on a turntable, so masks are made before cameras")
             files.finish(project.out, TURNED, True)
     first = _masks_before_cameras(project, given, asked)
-    _say("cameras", f"from the masked part of {given.path}")
+    _say("cameras", f"found from the masked parts of {given.path}")
     return poses(given.path, done, masks=first, config=config)
 
 
@@ -336,7 +336,7 @@ def _masks_before_cameras(project: Project, given: Given, asked: CaptureOptions)
             f"find cameras: expected masks={choices.REMBG} or a folder of masks, got {masks}",
             "masks",
         )
-    _say("masks", "from a network, for each photograph")
+    _say("masks", "made by a network, for each photograph")
     masked = mask_network(asked.network)
     pictures, _, _ = photographs_of(given.path, folders_of(project.scene))
     require_readers(pictures)
@@ -371,7 +371,7 @@ def _find_masks(project: Project, scene: Path, asked: CaptureOptions) -> Path:
         made = {k: " ".join(map(str, v)) if k == "box" else v for k, v in made.items()}
         words = ", ".join(f"{name}={value}" for name, value in made.items())
         return ExistingFile(
-            f"{project.cut} was made with {words}: to make it again, remove this folder and "
+            f"{project.cut} was made with {words}: to make the masks again, remove this folder and "
             f"{project.run}",
             *made,
         )

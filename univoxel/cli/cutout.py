@@ -19,13 +19,13 @@ class CutoutOptions:
     source: Annotated[str, written("rembg|FOLDER|none", "rembg", name="from")] = "rembg"
     """source of the masks: rembg (a network), none (depth only), or a folder of masks"""
     network: NetworkName = NETWORK
-    """network that makes the masks; later ones are larger, slower and more accurate"""
+    """network that makes the masks; those listed later are slower but more accurate"""
     box: BoxOf = None
     """corners of a box around the object, in the world of the written cameras"""
     keep_table: bool = False
-    """keep the table inside the box; needs --from none"""
+    """keep the part of the table that is inside the box; needs --from none"""
     downscale: DownscaleBy = "auto"
-    """write photographs at 1/N of their size; auto: no finer than the grids can use"""
+    """write photographs at 1/N of their size; auto: as large as the grids can use"""
     allow_outside: bool = False
     """also read files outside the folder if the data set refers to them"""
 

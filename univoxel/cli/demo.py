@@ -37,7 +37,7 @@ def command(asked: DemoOptions) -> Path:
 
     Raises:
         OSError: `out` cannot be written.
-        UserError: the run that is there cannot be read.
+        UserError: `out` contains a run that cannot be read.
     """
     from univoxel.cli.trainer import train
     from univoxel.config import StageConfig

@@ -42,7 +42,7 @@ class Finding:
 @dataclass(frozen=True)
 class DoctorOptions:
     json: JsonFile = None
-    """write the findings to a file as JSON; - prints them in place of the table"""
+    """write the findings to a file as JSON; - prints them instead of the table"""
 
 
 @takes(DoctorOptions)

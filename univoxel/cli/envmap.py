@@ -21,7 +21,7 @@ class EnvmapOptions:
     out: Annotated[File, written("FILE.exr|hdr")]
     """environment map to write, in linear radiance; a preview is written beside it"""
     height: Annotated[int, written("ROWS")] = MAP_ROWS
-    """rows of the map; it has twice as many columns"""
+    """number of rows of the map, which has twice as many columns"""
     light_of: LightOf = None
     """training view (name or number) whose light to write; see train --varying"""
 

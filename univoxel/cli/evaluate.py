@@ -34,22 +34,22 @@ class EvaluateOptions:
     save: Annotated[parsing.File | None, parsing.written("DIR", "none are written")] = None
     """folder to write the rendered images to"""
     json: parsing.JsonFile = None
-    """write the metrics to a file as JSON; - prints them in place of the table"""
+    """write the metrics to a file as JSON; - prints them instead of the table"""
     samples: int = SAMPLES
-    """light samples per pixel of relit images"""
+    """number of light samples per pixel in relit images"""
     bounces: Annotated[int, parsing.ADVANCED] = BOUNCES
     """number of reflections between parts of the object in relit images"""
     light_of: parsing.LightOf = None
-    """training view (name or number) in whose light to render; see train --varying"""
+    """render under the light of this training view (name or number)"""
     test_every: Annotated[int | None, parsing.written("N", "the test split", advanced=True)] = None
-    """use every Nth photograph as a test view; none may be a training photograph"""
+    """test on every Nth photograph; none of these may have been used for training"""
     background: Annotated[Behind, parsing.ADVANCED] = "black"
     """background of the novel views"""
     fit_light: Annotated[bool, parsing.ADVANCED] = False
     """fit the light to each test photograph before measuring, as many papers do"""
 
     full_size: bool = False
-    """also measure novel views at full size, with the texture of train or detail"""
+    """also measure novel views at full size, with the full-size texture of the run"""
 
     def __post_init__(self) -> None:
         if self.samples < 1 or self.bounces < 0:
@@ -181,7 +181,7 @@ def _at_full_size(
     try:
         train = photos_of(run, data, "train")
     except (UserError, OSError) as error:  # views are the model's only
-        log.info("full size: novel views use only the model, not the photographs: %s", error)
+        log.info("full size: without photographs, novel views use only the model: %s", error)
         train = None
     return dict(measure_full_size(scene, run, photos, train, save))
 

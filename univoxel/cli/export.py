@@ -37,15 +37,15 @@ class ExportOptions:
     run: Run
     """folder of a trained run"""
     mesh: Annotated[File, written("FILE.glb|usdz|obj|ply")]
-    """mesh file to write; .glb, .usdz and .obj have textures, .ply vertex colours"""
+    """mesh file to write; .glb, .usdz and .obj have textures, .ply has vertex colours"""
     faces: Annotated[int | None, written("N", "20000 with textures, else no limit")] = None
     """maximum number of triangles, at least 4"""
     texture_size: Annotated[
-        int | None, written("TEXELS", "that of the run's detail, else 1024")
+        int | None, written("TEXELS", "as the full-size texture, else 1024")
     ] = None
     """width of the square textures, a power of 2 up to 4096"""
     watertight: bool = False
-    """close all holes; an error if that is impossible"""
+    """close all holes, or fail if that is impossible"""
     texture_format: Annotated[choices.TextureFormat, ADVANCED] = "png"
     """png is lossless, jpeg is smaller"""
     quality: Annotated[int, written("1-95", advanced=True)] = choices.TEXTURE_QUALITY
@@ -108,7 +108,7 @@ def export(asked: ExportOptions) -> list[Path]:
     """Export the surface as a mesh with materials.
 
     Returns:
-        The files of the levels of detail, the finest first, each written whole or not at all.
+        The files of the levels of detail, finest first; each is written atomically.
 
     Raises:
         UserError: the run cannot be used, an argument is out of range, there is

@@ -50,17 +50,17 @@ class InfoOptions:
     run: Run
     """folder of a trained run"""
     json: JsonFile = None
-    """write the numbers to a file as JSON; - prints them in place of the tables"""
+    """write the numbers to a file as JSON; - prints them instead of the tables"""
     picture: Annotated[File | None, written("FILE.png", "none")] = None
-    """image to write: where the grid stores features, and the size of each part"""
+    """image to write; shows where features are stored and the size of each part"""
 
 
 @takes(InfoOptions)
 def command(asked: InfoOptions) -> None:
     """Show the verdict, the parts and the sizes of a run.
 
-    Lists parameters and bytes by part, and the epipolar error of points that are matched between
-    the photographs.
+    Lists the parameters and bytes of each part, and the epipolar error of points that are matched
+    between the photographs.
     """
     import rich
     from rich.text import Text
@@ -106,7 +106,7 @@ def info(asked: InfoOptions) -> dict[str, Any]:
     found["bytes"] = (run / FILE).stat().st_size
     found["cameras"] = camera_check(scene, run)
     verdict = load_verdict(run)
-    unknown = "Result: unfinished, because training has not ended. To finish, train with --resume"
+    unknown = "Result: unfinished, because training has not ended; to finish it, use train --resume"
     if (run / "trust.txt").exists():
         unknown = "Result: unknown, because the run was trained by a version before 0.3"
     found["said"] = unknown if verdict is None else verdict.sentence()
@@ -211,7 +211,7 @@ def tables(found: dict[str, Any]) -> Iterable[Table | str]:
     x, y, z = grid["size"]
     table.add_row("nodes of the grid", f"{x} x {y} x {z}")
     table.add_row("voxel, world units", f"{grid['voxel_size']:.4g}")
-    table.add_row("nodes with their own distance", f"{grid['share_with_distance']:.1%}")
+    table.add_row("nodes that store a distance", f"{grid['share_with_distance']:.1%}")
     table.add_row("nodes with features", f"{grid['share_with_features']:.1%}")
     table.add_row("feature channels", f"{found['channels']}")
     table.add_row("features used for materials", f"{found['material_channels']}")
@@ -220,7 +220,7 @@ def tables(found: dict[str, Any]) -> Iterable[Table | str]:
     yield table
     if found["cameras"] is None:
         return
-    title = "Epipolar error of matched points, pixels"
+    title = "Epipolar error of matched points, in pixels"
     table = Table("cameras", "median", "90 %", title=title)
     for column in table.columns[1:]:
         column.justify = "right"

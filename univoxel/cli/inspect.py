@@ -29,7 +29,7 @@ class InspectOptions:
     out: Annotated[File | None, written("FILE.png", "in RUN/inspect")] = None
     """image to write; its layers are written beside it as .exr"""
     height: Annotated[int, written("ROWS")] = MAP_ROWS
-    """rows of the environment maps in the image"""
+    """number of rows of the environment maps in the image"""
     light_of: LightOf = None
     """training view (name or number) whose light to draw; see train --varying"""
 
@@ -38,12 +38,12 @@ class InspectOptions:
 def inspect(asked: InspectOptions) -> Path:
     """Draw the light that reaches one point of the surface.
 
-    If the data set has ground truth, its light is drawn beside it.
+    If the data set has ground truth, the true light is drawn beside the recovered light.
 
     Raises:
         DataError: the run or its data cannot be read.
-        UserError: no such view or pixel, or no surface under it; an argument out of range;
-            light_of is no training view, or light does not vary.
+        UserError: the view or pixel does not exist, there is no surface under the pixel, another
+            argument is out of range, or the run has no light for light_of.
         OSError: a file cannot be written.
     """
     # The PNG holds a lat-long picture for each thing the scene knows: its local light, its distant

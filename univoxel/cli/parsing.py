@@ -100,7 +100,7 @@ class Common:
     quiet: bool = False
     """print only results, warnings and errors"""
     verbose: bool = False
-    """print details, elapsed seconds, and the traceback of an error"""
+    """print details, elapsed seconds and tracebacks of errors"""
     threads: Annotated[int | None, written("N", "one per core")] = None
     """number of threads, at most one per core"""
 

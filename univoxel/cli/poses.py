@@ -18,19 +18,19 @@ class PosesOptions:
     out: Annotated[Path, written("SCENE")]
     """folder to write to; delete its sfm/ when you are done"""
     masks: Annotated[Path | None, written("DIR", "the whole images")] = None
-    """folder of masks inside which features are detected; required on a turntable"""
+    """folder of masks, to detect features inside them only; required on a turntable"""
     every: Annotated[float | None, written("SECONDS", "80 frames in all")] = None
     """from each period of this length in a video, take the sharpest frame"""
     keep_size: Annotated[int, written("PIXELS", advanced=True)] = KEEP_SIZE
-    """maximum longer side of the photographs to write; 0: original size"""
+    """maximum width and height of the written photographs; 0: original size"""
     keep_weak: Annotated[bool, ADVANCED] = False
     """keep photographs with unreliable poses"""
     size: Annotated[int, written("PIXELS", advanced=True)] = FEATURE_SIZE
-    """longer side at which to detect features"""
+    """longer side of the images in which features are detected"""
     features: Annotated[int | None, written("N", "4096; with --fast: 2048", advanced=True)] = None
     """maximum number of features per photograph"""
     fast: bool = False
-    """detect fewer features, four times faster; may lose views of smooth objects"""
+    """detect features four times faster, but fewer; may lose views of smooth objects"""
     seed: Annotated[int, ADVANCED] = 0
     """random seed"""
 

@@ -72,7 +72,7 @@ class RelightOptions:
     samples: int = SAMPLES
     """light samples per pixel"""
     noise: Annotated[float | None, written("SHARE", advanced=True)] = None
-    """in place of --samples: add samples until the relative noise is below SHARE"""
+    """instead of --samples: add samples until the relative noise is below SHARE"""
     bounces: Annotated[int, ADVANCED] = BOUNCES
     """number of reflections between parts of the object"""
     background: Background = "transparent"
@@ -128,7 +128,7 @@ class Relight(RelightOptions, Where):  # whose fields come first
     animation: Annotated[tuple[Animation, ...], written(default="none")] = ()
     """also write the frames as an animation"""
     resume: bool = False
-    """keep frames that exist already"""
+    """keep frames that already exist"""
 
 
 @takes(Relight)
@@ -186,7 +186,7 @@ def parse_ground(text: str | float | None) -> Ground:
     try:
         return float(text)
     except ValueError:
-        raise UserError(f"--ground: expected lowest or a height, got {text!r}") from None
+        raise UserError(f"--ground: expected a height or the word lowest, got {text!r}") from None
 
 
 def relight_to_files(

@@ -16,7 +16,7 @@ class ReportOptions:
     run: Run
     """folder of a trained run"""
     html: Annotated[Path | None, written("FILE.html", "RUN/report.html")] = None
-    """page to write; it works offline"""
+    """web page to write, which works offline"""
     data: DataOf = None
     """folder of the photographs, if they were moved"""
     views: Annotated[int, written("N")] = 4
@@ -30,8 +30,8 @@ def command(asked: ReportOptions) -> Path:
     """Report how good a run is and what to photograph next.
 
     The web page shows photographs beside their render, expected errors, materials,
-    light, the progress of training, and directions from which more photographs would help. It needs
-    no ground truth.
+    light, the progress of training, and directions from which more photographs would help. The
+    report needs no ground truth.
     """
     return report(**vars(asked))
 

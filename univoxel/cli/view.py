@@ -19,13 +19,13 @@ class ViewOptions:
     run: Run
     """folder of a trained run"""
     html: Annotated[File | None, written("FILE.html", "a server")] = None
-    """write a page that works offline instead of starting the server"""
+    """write a page that works offline, and do not start the server"""
     envmap: Annotated[tuple[File, ...], written("MAP [MAP ...]", "the built-in maps")] = ()
     """additional environment maps to offer"""
     title: Title = None
     """heading of the page"""
     host: Annotated[str, written("ADDRESS")] = "127.0.0.1"
-    """address to listen on; 127.0.0.1 accepts only this machine"""
+    """address to listen on; with 127.0.0.1, only this machine can connect"""
     port: Annotated[int, written("N")] = 8080
     """port to listen on; 0: any free port"""
 
@@ -35,7 +35,7 @@ def command(asked: ViewOptions) -> Path | None:
     """View and relight a run in a browser, or write a web page.
 
     Returns:
-        The page, which is written atomically; None after a server has ended.
+        The page, which is written atomically; None if a server was started instead.
 
     Raises:
         UserError: the run or a map cannot be used, there is no surface, or the port is in use.

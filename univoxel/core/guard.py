@@ -40,11 +40,11 @@ runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
 
 
 def command(arguments: Sequence[str]) -> list[str]:
-    """The command line of a process of Python that runs this package, and nothing of the working
-    folder; it ends with this process.
+    """The command line of a Python process that runs this package and imports nothing from the
+    working folder; it ends with this process.
 
     Args:
-        arguments: of Python, which begin with -m MODULE or -c PROGRAM.
+        arguments: for Python; they begin with -m MODULE or -c PROGRAM.
     """
     packages = dict.fromkeys(name.partition(".")[0] for name in (__name__, arguments[1]))
     files = [f"{p}={sys.modules[p].__file__}" for p in packages if p in sys.modules]

@@ -87,7 +87,7 @@ def mapped(path: Path, offset: int, shape: Sequence[int], dtype: torch.dtype) ->
         OSError: the file cannot be written.
     """
     if offset % dtype.itemsize:
-        raise ValueError(f"{path}: the numbers at offset {offset} are not aligned")
+        raise ValueError(f"{path}: offset {offset} is not a multiple of {dtype.itemsize} bytes")
     end = offset + math.prod(shape) * dtype.itemsize
     if (size := path.stat().st_size) < end:  # it would be made longer, with zeros
         raise ValueError(f"{path}: expected {end} bytes, got {size}")

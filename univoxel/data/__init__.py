@@ -79,7 +79,7 @@ def load_photos(
         f"{some(files) or 'an empty folder'}. If these are photographs without cameras, run "
         f"`univoxel capture {folder} --out DIR` (looked for transforms_{split}.json, "
         "transforms.json, a COLMAP model (cameras and images, .bin or .txt) in sparse/0, "
-        "sparse, colmap/sparse/0 or here, poses_bounds.npy, cameras_sphere.npz, "
+        "sparse, colmap/sparse/0 or the folder itself, poses_bounds.npy, cameras_sphere.npz, "
         "inputs/sfm_scene.json, keyframes/corrected_cameras, Metashape XML, RealityCapture CSV, "
         f"{split}_000/metadata.json)"
     )

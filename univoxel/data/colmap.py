@@ -130,7 +130,7 @@ def read_cameras(path: Path) -> dict[int, Lens]:
                 radial, tangential = (p[4], p[5], p[8] if p[8:] else 0.0), (p[6], p[7])
                 lens = Lens(width, height, (p[0], p[1]), (p[2], p[3]), radial, tangential)
         if min(width, height) <= 0 or not np.isfinite(p).all():
-            raise ValueError(f"camera {number} has invalid size {width}x{height} or values {p}")
+            raise ValueError(f"camera {number}: invalid size {width}x{height} or parameters {p}")
         lenses[number] = checked(lens)
     return lenses
 
@@ -212,7 +212,7 @@ def _cameras_text(path: Path) -> Iterator[tuple[int, str, int, int, list[float]]
             continue
         number, model, width, height, *rest = line.split()
         if len(rest) != _parameters(path, int(number), model):
-            raise ValueError(f"camera {number} has the wrong number of parameters, {len(rest)}")
+            raise ValueError(f"camera {number}: {len(rest)} parameters do not fit {model}")
         yield int(number), model, int(width), int(height), [float(value) for value in rest]
 
 

@@ -181,8 +181,8 @@ def _old_run_lengths(path: Path, body: bytes, height: int, width: int) -> np.nda
     count = np.where(runs, pixels[:, 3].astype(np.int64) << power, 1)
     if len(body) % 4 or not len(last) or last[0] < 0 or count.sum() != height * width:
         raise DataError(
-            f"{path}: expected {width}x{height} pixels, as {4 * height * width} flat bytes or "
-            f"run-length encoded rows, got {len(body)} bytes"
+            f"{path}: expected {width}x{height} pixels, as {4 * height * width} uncompressed bytes "
+            f"or run-length encoded rows, got {len(body)} bytes"
         )
     return np.repeat(pixels[last], count, 0).reshape(height, width, 4)
 
@@ -618,7 +618,7 @@ def is_heif(path: Path) -> bool:
 def _what_it_is(path: Path, error: Exception) -> str:
     """Why a file could not be read: it may be of another kind than its name says."""
     if is_heif(path):
-        return "but it is HEIC or AVIF: convert it to JPEG, as `univoxel poses` does"
+        return "but the file is HEIC or AVIF: convert it to JPEG, as `univoxel poses` does"
     with path.open("rb") as file:
         head = file.read(4)
     if head in (b"II*\0", b"MM\0*"):

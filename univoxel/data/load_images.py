@@ -145,8 +145,8 @@ def _reread(shot: Shot, pinhole: Lens, factor: int) -> Tensor:
     color, alpha = read_photo(shot.image, masks=False)
     if color.shape[:2] != (shot.lens.height, shot.lens.width):
         raise DataError(
-            f"{shot.image}: expected {shot.lens.width}x{shot.lens.height} pixels as when it was "
-            f"first read, got {size_of(color)}"
+            f"{shot.image}: expected {shot.lens.width}x{shot.lens.height} pixels, as when the "
+            f"file was first read, got {size_of(color)}"
         )
     grid = sources(shot.lens, pinhole) if shot.lens.bent else None
     return resampled(color, alpha, factor, grid)[0]
@@ -220,7 +220,7 @@ def _read_all(
     if upright is not None:
         turned = sum(orientation(image) != 1 for image, _ in pairs)
         log.info(
-            "%d photographs have an EXIF orientation: their masks seem to be made for %s",
+            "%d photographs have an EXIF orientation, and their masks seem to match %s",
             *(turned, "the upright image" if upright else "the stored pixels"),
         )
     reading = Reading.resumed(origin)
@@ -235,8 +235,8 @@ def _read_all(
                 reading = Reading.begun(origin, color, alpha, size)
             if color.dtype != reading.color.dtype:
                 raise DataError(
-                    f"{shots[view].image}: expected all photographs in the format of "
-                    f"{shots[0].name}"
+                    f"{shots[view].image}: expected all photographs to have the same "
+                    f"format as {shots[0].name}"
                 )
             if alpha.dtype != reading.alpha.dtype:
                 alpha, reading = coverage_of(alpha), reading.with_floating_alpha()
@@ -513,7 +513,7 @@ def upright(shots: Sequence[Shot]) -> tuple[list[Shot], list[str]]:
     held = np.stack([_right_and_up(shot) for shot in shots])
     up = up_direction(held)
     if up is None:
-        return shots, [*moved, "world not rotated: its cameras do not show which direction is up"]
+        return shots, [*moved, "world not rotated, because cameras do not show which way is up"]
     if up[2] >= math.cos(LEAN):
         return shots, moved
     turned = in_moved_world(shots, np.column_stack([turn_to_z(up), np.zeros(3)]))
@@ -563,7 +563,7 @@ def up_direction(held: np.ndarray) -> np.ndarray | None:
 def check_name(name: str, where: str) -> None:
     """Refuse, by a DataError, names of views with which files would not stay in their folder."""
     if name in ("", "..") or Path(name).name != name or not system.can_be_a_name(name):
-        raise DataError(f"{where}: expected a name that can be a file name, got {name!r}")
+        raise DataError(f"{where}: expected a name that is valid as a file name, got {name!r}")
 
 
 def _check(folder: Path, shots: Sequence[Shot], downscale: int) -> None:

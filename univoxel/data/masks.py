@@ -117,7 +117,7 @@ def require_all(where: Path, photographs: Named, masked: Sequence[bool]) -> None
         raise DataError(
             f"{where}: expected a mask for each of {len(photographs)} photographs, got none for "
             f"{len(without)}: {some([p.name for p in without])} (looked for "
-            f"{first.stem}.png, {first.name}.png, {first.stem}_mask.png and the like)"
+            f"{first.stem}.png, {first.name}.png, {first.stem}_mask.png and similar names)"
         )
 
 
@@ -214,8 +214,8 @@ def _paired(masks: Sequence[Path], root: Path | None, photographs: Named) -> lis
         if root is not None and mask and whose.setdefault(mask, image) != image:
             raise DataError(
                 f"{mask}: expected a mask of one photograph, but its name matches {whose[mask]} "
-                f"and {image}: put each mask into a subfolder named like its photograph's, or "
-                f"name it after the whole file name, like {image.name}.png"
+                f"and {image}: put each mask into a subfolder named like that of its photograph, "
+                f"or name it after the whole file name, such as {image.name}.png"
             )
         found.append(mask)
     return found
@@ -386,7 +386,7 @@ def _of_wide_numbers(values: np.ndarray, path: Path) -> Tensor:
     """Of a picture of 32 bits: of 0 and 1, or as much as 8 or 16 bits hold."""
     top = float(values.max())
     if not np.isfinite(values).all() or top > 65535:
-        raise DataError(f"{path}: expected mask values up to 65535, got up to {top:g}")
+        raise DataError(f"{path}: expected mask values up to 65535, got values up to {top:g}")
     return _scaled(torch.from_numpy(values / (65535 if top > 255 else 1)), path)
 
 

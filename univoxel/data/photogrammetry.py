@@ -75,7 +75,7 @@ def list_metashape(folder: Path, split: str) -> Listed:
     every = list(chunk.iterfind("cameras//camera"))
     placed = [c for c in every if c.find("transform") is not None and c.get("enabled") not in OFF]
     if not placed:
-        raise DataError(f"{path}: expected cameras with a transform, got {len(every)} without one")
+        raise DataError(f"{path}: none of the {len(every)} cameras is both aligned and enabled")
     component, _ = Counter(c.get("component_id") for c in placed).most_common(1)[0]
     chosen = [c for c in placed if c.get("component_id") == component]
     world = _world(chunk, component, path)
@@ -279,7 +279,7 @@ def _rows(path: Path) -> list[tuple[int, dict[str, str]]]:
             row |= {key: v.replace(",", ".") for key, v in row.items() if key != "name"}
         rows.append((number, row))
     if not rows:
-        raise DataError(f"{path}: expected a line per camera, got none")
+        raise DataError(f"{path}: expected a line for each camera, got none")
     return rows
 
 
@@ -342,7 +342,7 @@ def list_polycam(folder: Path, split: str) -> Listed:
     note = f" (looked in {pictures}"
     others = folder / f"{place.removesuffix('corrected_')}images"
     if others != pictures and others.is_dir():
-        note += f"; those in {others} belong to the cameras in {others.with_name('cameras')}"
+        note += f"; the images in {others} belong to the cameras in {others.with_name('cameras')}"
     lost = left_out(str(cameras[0].parent), missing, len(cameras), f"{note})")
     shots = every_eighth(folder, in_moved_world(shots, UPRIGHT), split)
     return Listed("Polycam raw data", shots, [*lost, "world rotated so that +Z is up (was +Y)"])

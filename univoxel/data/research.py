@@ -90,8 +90,8 @@ def _llff_pictures(folder: Path) -> list[Path]:
         if pictures := photographs_in(place):
             return pictures
     raise DataError(
-        f"{folder / LLFF_FILE}: expected images in {folder / 'images'}, images_2 or images_4 etc., "
-        "found none"
+        f"{folder / LLFF_FILE}: expected images in {folder / 'images'}, images_2, images_4 or "
+        "similar, found none"
     )
 
 
@@ -228,7 +228,7 @@ def _numbers(path: Path, known: list[int], pictures: list[Path]) -> list[int]:
         return found
     raise DataError(
         f"{path}: expected a world_mat for each of {len(pictures)} photographs in "
-        f"{pictures[0].parent}, got {len(known)}, whose numbers are not in the photographs' names"
+        f"{pictures[0].parent}, got {len(known)}, whose numbers do not match the photographs' names"
     )
 
 
@@ -340,7 +340,7 @@ def list_tensoir(folder: Path, split: str) -> Listed:
     """Photographs under the light of the training views."""
     views = sorted(path.parent for path in folder.glob(f"{split}_*/metadata.json"))
     if not views:
-        raise DataError(f"{folder}: expected {split}_000/metadata.json and more, got none")
+        raise DataError(f"{folder}: expected {split}_000/metadata.json and so on, got none")
     picture = photographed(folder)
     there = [view for view in views if (view / picture).is_file()]
     missing = [view / picture for view in views if view not in there]

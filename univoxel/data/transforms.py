@@ -67,7 +67,7 @@ def load_cameras(
     """
     path = Path(path)
     if not path.is_file():
-        raise DataError(f"{path}: expected a camera file, but there is no such file")
+        raise DataError(f"{path}: this camera file does not exist")
     root, frames = read_transforms(path)
     names = view_names([str(f.get("file_path", f"{i:04d}")) for i, f in enumerate(frames)])
     for index, name in enumerate(names):
@@ -196,7 +196,7 @@ def _folder(path: Path, frame: dict[str, Any], where: str) -> Path:
     if scene is None:
         return path.parent
     if not isinstance(scene, str) or Path(scene).name != scene or scene in ("", ".."):
-        raise DataError(f"{where}: expected scene_name as the name of a folder, got {short(scene)}")
+        raise DataError(f"{where}: expected the name of a folder as scene_name, got {short(scene)}")
     return path.parent.resolve().parent / scene
 
 
@@ -331,7 +331,7 @@ def lens_of(values: dict[str, Any], where: str, width: int, height: int, note: s
             + ("a fisheye" if values.get("is_fisheye") else short(model))
         )
     if more := [key for key in ("k4", "k5", "k6") if values.get(key)]:
-        raise DataError(f"{where}: expected distortion k1 k2 k3 p1 p2 only, got {more[0]} too")
+        raise DataError(f"{where}: expected only distortion by k1 k2 k3 p1 p2, got {more[0]}")
     if "fl_x" in values:
         x = read_number(values, "fl_x", where, 0.0, math.inf)
         y = read_number(values, "fl_y", where, 0.0, math.inf) if "fl_y" in values else x
@@ -464,13 +464,13 @@ def _named(
 ) -> list[load_images.Shot]:
     """The shots of a split. What is listed and has no picture is left out of it, too."""
     if not isinstance(chosen, list) or not all(isinstance(name, str) for name in chosen):
-        raise DataError(f"{path}: expected {key} as a list of file_paths, got {short(chosen)}")
+        raise DataError(f"{path}: expected a list of file_paths as {key}, got {short(chosen)}")
     by_name, every = {shot.name: shot for shot in shots}, view_names(listed)
     known = {name: name for name in every} | dict(zip(listed, every, strict=True))
     names = [known.get(name) or known.get(view_name(name)) for name in chosen]
     if None in names or not names:
         came = view_name(chosen[names.index(None)]) if names else "an empty list"
-        raise DataError(f"{path}: expected only frames of this file in {key}, got {came}")
+        raise DataError(f"{path}: expected {key} to list only frames of this file, got {came}")
     found = [by_name[name] for name in names if name in by_name]
     if not found:
         raise DataError(f"{path}: expected images of frames in {key}, found none of {len(names)}")

@@ -234,14 +234,14 @@ def compare(
     which: tuple[Tensor, Tensor],
     roughness_step: float,
 ) -> tuple[Tensor, Tensor]:
-    """Mean absolute difference in sRGB of photographs and render, and root mean square of the
-    render's slope by roughness: [P] each, 0 without an observation.
+    """Mean absolute sRGB difference between photographs and render, and root mean square of the
+    render's slope by roughness: [P] each; 0 for points without observations.
 
-    A clipped pixel says only that it was at least so bright.
+    A clipped pixel is only a lower bound of the brightness.
 
     Args:
-        which: points and numbers of the observations that are compared.
-        roughness_step: that the slope is taken over.
+        which: indices of the points and observations that are compared.
+        roughness_step: change in roughness over which the slope is measured.
     """
     point, observation = which
     features = scene.field.features_at(observations.position)
@@ -390,7 +390,7 @@ def words(figures: dict[str, float], troubles: list[str]) -> str:
         troubles: what went wrong in training, from its state.
     """
     sentences = [
-        f"Expected error, mean over the surface: {figures['albedo_error']:.2f} for the albedo (in "
+        f"Mean expected error of the surface: {figures['albedo_error']:.2f} for the albedo (in "
         f"sRGB), {figures['roughness_error']:.2f} for the roughness, {figures['normal_error']:.0f} "
         "degrees for the normals.",
         *(
@@ -415,8 +415,8 @@ def words(figures: dict[str, float], troubles: list[str]) -> str:
         if figures[name] >= MIN_SHARE:
             sentences.append(f"{figures[name]:.0%} of the surface {text}.")
     sentences.append(
-        "Photographs cannot separate the brightness of albedo and light: compare albedos with "
-        "one another, not with a colour chart."
+        "Photographs cannot tell a bright albedo from a bright light: compare albedos with one "
+        "another, not with a colour chart."
     )
     if troubles:
         last = f"The last one: {troubles[-1]}."
@@ -455,11 +455,11 @@ class AdviceConfig:
     least: float = setting(
         0.006,
         "minimum worth of a photograph: the share of the surface that it would show better, times "
-        "how little is known there",
+        "the uncertainty there",
         least=0,
         most=1,
     )
-    share: float = setting(0.5, "minimum worth relative to that of the best", least=0, most=1)
+    share: float = setting(0.5, "minimum worth, relative to the best photograph", least=0, most=1)
 
     __post_init__ = check_settings
 

@@ -253,8 +253,8 @@ def every_nth(photos: Photos, trained: list[str], every: int) -> Photos:
     chosen = sorted([*photos.names, *trained])[::every]
     if seen := sorted(set(chosen) & set(trained)):
         raise UserError(
-            f"test_every {every} selects {len(seen)} photographs that were trained on, such as "
-            f"{seen[0]}: test views must be photographs that training did not see",
+            f"test_every {every} selects {len(seen)} training photographs, such as "
+            f"{seen[0]}: no test view may have been used for training",
             "test_every",
         )
     return photos.of(torch.tensor([photos.names.index(name) for name in chosen]))
@@ -297,22 +297,22 @@ def _check_size(photos: Photos, view: int, picture: Tensor, what: str) -> None:
 MEASURES = {
     "nvs_psnr": "novel views, PSNR, dB",
     "nvs_ssim": "novel views, SSIM",
-    "albedo_psnr_raw": "albedo PSNR, dB, not scaled",
+    "albedo_psnr_raw": "albedo PSNR, dB, without scaling",
     "albedo_psnr_1ch": "albedo PSNR, dB, scaled by one factor",
     "albedo_psnr_3ch": "albedo PSNR, dB, scaled per channel",
     "albedo_psnr_fg": "albedo PSNR, dB, scaled per channel, inside the mask",
     "roughness_mse": "roughness MSE, inside the mask",
-    "relit_psnr": "relit PSNR, dB, albedo scaled per channel",
-    "relit_psnr_raw": "relit PSNR, dB, albedo not scaled",
+    "relit_psnr": "relit PSNR, dB, with the albedo scaled per channel",
+    "relit_psnr_raw": "relit PSNR, dB, without scaling of the albedo",
     "normal_mae_deg": "normals, mean error inside the mask, degrees",
     "chamfer": "Chamfer distance, world units",
-    "trust_spearman": "rank correlation of expected and true error, albedo",
-    "trust_spearman_roughness": "rank correlation of expected and true error, roughness",
-    "trust_spearman_normal": "rank correlation of expected and true error, normals",
-    "train_seconds": "training, seconds",
-    "threads": "threads in training",
-    "peak_rss_mb": "peak memory in training, MB",
-    "parameters": "parameters",
+    "trust_spearman": "rank correlation of expected and true albedo error",
+    "trust_spearman_roughness": "rank correlation of expected and true roughness error",
+    "trust_spearman_normal": "rank correlation of expected and true normal error",
+    "train_seconds": "training time, seconds",
+    "threads": "threads used in training",
+    "peak_rss_mb": "peak memory during training, MB",
+    "parameters": "number of parameters",
     "model_bytes": "size of the model file, bytes",
 }
 

@@ -50,7 +50,7 @@ def recovered_map(scene: Scene, run: Path, height: int) -> Tensor:
 
 
 def compare(recovered: Tensor, true: Tensor) -> Comparison:
-    """Maps [H, 2 H, 3] of any two sizes, of one scale."""
+    """Compare two maps [H, 2 H, 3] of the same scale; their sizes may differ."""
     normal = fibonacci_sphere(NORMALS)
     balls = torch.stack([grey_ball(m, normal) for m in (recovered, true)])
     encoded = linear_to_srgb(balls / balls[1].max())

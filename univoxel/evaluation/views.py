@@ -174,7 +174,7 @@ def survey_of(scene: Scene, run: Path, data: Path | None) -> Survey | None:
     try:
         return survey(scene, photos_of(run, data, "train"), POINTS)
     except UserError as error:  # no photographs to train on, or no surface
-        log.info("no expected errors are told: %s", error, extra={"arguments": error.arguments})
+        log.info("expected errors are missing: %s", error, extra={"arguments": error.arguments})
         return None
 
 

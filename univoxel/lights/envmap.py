@@ -27,7 +27,7 @@ class EnvmapConfig(LatLongConfig):
     """An environment map of texels, with traced visibility."""
 
     kind: Literal["envmap"] = field(default="envmap", init=False, metadata=KIND)
-    rows: int = setting(256, "rows of the map", least=1, most=MOST_ROWS)
+    rows: int = setting(256, "number of rows of the map", least=1, most=MOST_ROWS)
     directions: int = setting(64, "directions in training", least=1, most=MOST_DIRECTIONS)
     directions_eval: int = setting(256, "directions in evaluation", least=1, most=MOST_DIRECTIONS)
 
@@ -100,7 +100,7 @@ class EnvmapSGConfig(LatLongConfig):
         100.0, "maximum sharpness of a lobe, whose half width is sqrt(2 / sharpness) rad", above=0
     )
     rows: int = setting(
-        64, "rows of the map to which the lobes are rendered", least=1, most=MOST_ROWS
+        64, "number of rows of the map that the lobes are rendered to", least=1, most=MOST_ROWS
     )
     directions: int = setting(64, "directions in training", least=1, most=MOST_DIRECTIONS)
     directions_eval: int = setting(256, "directions in evaluation", least=1, most=MOST_DIRECTIONS)

@@ -79,7 +79,7 @@ def reflected(
             if shape != wanted:
                 raise ValueError(f"reflected: {name} must be {list(wanted)}, got {list(shape)}")
         if generator is not None:
-            raise ValueError("reflected: expected an occlusion or a generator, but not both")
+            raise ValueError("reflected: expected either an occlusion or a generator, got both")
     rotation = rotations(surface, generator) if occlusion is None else occlusion.rotation
     wi = half_sphere(surface, directions, rotation)
     radiance = light.incident(surface, wi)

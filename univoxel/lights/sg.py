@@ -65,13 +65,13 @@ class SGConfig(LocalLightConfig):
     kind: Literal["sg"] = field(default="sg", init=False, metadata=KIND)
     lobes: int = setting(16, "lobes per point", least=1)
     hidden: int = setting(64, "width of the head", least=1)
-    layers: int = setting(2, "hidden layers of the head", least=0, most=MOST_LAYERS)
+    layers: int = setting(2, "number of hidden layers of the head", least=0, most=MOST_LAYERS)
     directions: int = setting(64, "directions in training", least=1, most=MOST_DIRECTIONS)
     directions_eval: int = setting(256, "directions in evaluation", least=1, most=MOST_DIRECTIONS)
     max_sharpness: float = setting(
         30.0, "maximum sharpness of a lobe, whose half width is sqrt(2 / sharpness) rad", above=0
     )
-    scale: float = setting(1.0, "half the extent of the lit region", unit="world units", above=0)
+    scale: float = setting(1.0, "half the size of the object's box", unit="world units", above=0)
 
     __post_init__ = check_settings
 

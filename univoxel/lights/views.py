@@ -261,7 +261,7 @@ class Turntable(Table):
         super().__post_init__()
         if self.others and not all(table.eyes for table in (self, *self.others)):
             raise ConfigError(
-                "Turntable: with several axes, each must have eyes (camera positions)"
+                "Turntable: if there are several axes, each needs camera positions (eyes)"
             )
 
     @staticmethod

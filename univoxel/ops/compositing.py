@@ -264,7 +264,7 @@ def _check(
         offsets=(samples.offsets, "N+1", torch.int64),
     )
     if not sdf.numel():
-        raise ValueError(f"{op}: sdf must have nodes, got {list(sdf.shape)}")
+        raise ValueError(f"{op}: sdf must not be empty, got {list(sdf.shape)}")
     if levels is not None:
         check_levels(op, sizes["T"], *levels)
 

@@ -180,7 +180,7 @@ class Differentiable(native.Operator):
         outputs = get_args(hints["return"]) or (Tensor,)
         lists = LIST in tensors.values()
         assert [*arguments] == [*tensors, *options], "tensors come before options"
-        assert not lists or to == [*tensors], "beside lists all tensors have gradients"
+        assert not lists or to == [*tensors], "with lists, all tensors need gradients"
         self._to = [[*tensors].index(n) for n in to]
         self._count, self._tensors = len(arguments), len(tensors)
         self._held, self._shown = held, len(outputs) - held
@@ -222,7 +222,7 @@ class Differentiable(native.Operator):
         given = [t for t in _flat(arguments) if isinstance(t, Tensor) and t.is_floating_point()]
         if any(forward_ad.unpack_dual(t).tangent is not None for t in given):
             raise NotImplementedError(
-                f"{self.name}: no derivative in forward mode (jvp, jacfwd, dual numbers): use "
+                f"{self.name}: forward mode (jvp, jacfwd, dual numbers) is not supported: use "
                 "torch.autograd.grad"
             )
 

@@ -201,7 +201,7 @@ def sample_dense(
         "sample_dense", sdf=(sdf, "X Y Z"), features=(features, "X Y Z C"), points=(points, "M 3")
     )
     if not sdf.numel():
-        raise ValueError(f"sample_dense: sdf must have nodes, got {list(sdf.shape)}")
+        raise ValueError(f"sample_dense: sdf must not be empty, got {list(sdf.shape)}")
     check_place("sample_dense", sizes["M"], origin, voxel_size)
     if native.serves(sdf):
         return _sample_dense(
@@ -292,7 +292,7 @@ def sample_sparse(
         "sample_sparse", sdf=(sdf, "R"), features=(features, "R C"), points=(points, "M 3")
     )
     if not bricks.table.numel():
-        raise ValueError(f"sample_sparse: bricks must have nodes, got size {list(bricks.size)}")
+        raise ValueError(f"sample_sparse: bricks must not be empty, got size {list(bricks.size)}")
     check_place("sample_sparse", sizes["M"], origin, voxel_size)
     if native.serves(sdf):
         return _sample_sparse(

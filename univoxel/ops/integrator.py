@@ -53,7 +53,7 @@ class Sun:
 
     def __post_init__(self) -> None:
         if not 0 < math.hypot(*self.direction) < math.inf:
-            raise ValueError(f"sun: direction must have a length, got {self.direction}")
+            raise ValueError(f"sun: direction must not be zero or infinite, got {self.direction}")
         _check_power("sun: irradiance", self.irradiance)
         if not 0 <= self.angle < 180:
             raise ValueError(f"sun: angle must be in [0, 180) degrees, got {self.angle}")

@@ -355,4 +355,4 @@ def _check_rows(op: str, rows: Tensor, count: int) -> None:
     """Each of the N rays is the ray of one pixel."""
     named = rows[rows >= 0].sort().values
     if not torch.equal(named, torch.arange(count, device=rows.device)):
-        raise ValueError(f"{op}: rows must contain each of the {count} rays once, and else -1")
+        raise ValueError(f"{op}: rows must contain each of the {count} rays once, and -1 elsewhere")

@@ -179,7 +179,7 @@ def sum_rows_reference(
     for r in rows:
         inside = not len(r) or (0 <= int(r[0]) and int(r[-1]) < count)
         if not inside or not bool((r[1:] > r[:-1]).all()):
-            raise ValueError(f"sum_rows: rows must ascend in [0, {count})")
+            raise ValueError(f"sum_rows: rows must be in ascending order in [0, {count})")
     total = values[0].new_zeros(count, values[0].shape[1])
     held = torch.zeros(count, dtype=torch.bool, device=total.device)
     for r, v in zip(rows, values, strict=True):

@@ -92,7 +92,7 @@ def configuration(run: Path) -> TrainConfig | None:
     try:
         return load_config(run / "config.json")
     except (UserError, OSError) as error:
-        log.info("no table of stages is shown: %s", error)
+        log.info("the table of stages is missing: %s", error)
         return None
 
 
@@ -149,8 +149,8 @@ FOLDER = Path(__file__).parent / "web"
 RING_GAP = 60.0  # degrees between neighbouring azimuths that are worth a word, as in `poses`
 TRUTH = "This report uses no ground truth: it is computed from the photographs and the model."
 CHARTS = (
-    "Stages minimise different losses, so the curve jumps between them. The validation PSNR is "
-    "that of the radiance head first, and that of light and materials once they are trained."
+    "Stages minimise different losses, so the curve jumps between them. The validation PSNR "
+    "measures the radiance head at first, and light and materials once they are trained."
 )
 LAYERS = {
     "render": "under the light of the photographs",
@@ -297,14 +297,14 @@ def next_section(advice: Advice) -> str:
         )
     told.append(
         f"The front is where {advice.front_name} was taken. Left and right are as seen from "
-        "there. Keep the distance and the light of the other photographs."
+        "the front. Keep the distance and the light of the other photographs."
     )
     parts += [paragraph(line) for line in told]
     legend = (
-        "Directions around the object, seen from above. White dots: photographs. Bright: a "
-        "photograph from there would help. Rings: gaps without photographs. Numbers: "
-        "photographs to take, the best first. Worth: the largest share of the surface that a "
-        "photograph could resolve."
+        "Directions around the object, seen from above. White dots: photographs. Bright areas: "
+        "a photograph from there would help. Rings: gaps without photographs. Numbers: "
+        "photographs to take, the best first. Worth: the share of the surface that a "
+        "photograph would show better, weighted by uncertainty."
     )
     left = "\n".join(parts)
     figure = f"<figure>{report_pictures.sphere(advice)}<figcaption>{legend}</figcaption></figure>"
@@ -333,9 +333,9 @@ def views_section(scene: Scene, known: Known, options: ReportOptions) -> str:
         caption = f"<figcaption>{escape(words)}</figcaption>"
         rows.append(f'<figure class="row">{tiles}{caption}</figure>')
     said = (
-        f"The {len(found)} of {count} compared photographs that differ most: photograph, render, "
-        f"and their difference, with white at {report_pictures.LIMIT} in sRGB. Numbers are for "
-        "the object only."
+        f"The {len(found)} of {count} compared photographs that differ most from their render: "
+        f"photograph, render and difference, which is white at {report_pictures.LIMIT} in sRGB. "
+        "The numbers ignore the background."
     )
     return paragraph(said) + f'<div class="views">{"".join(rows)}</div>'
 
@@ -362,8 +362,8 @@ def light_section(scene: Scene, mesh: Mesh) -> str:
     names = ("map", "diffuse sphere", "chrome sphere")
     tiles = zip(names, report_pictures.pictures_of(found), strict=True)
     legend = (
-        "Spheres are seen from +X, with +Z up. In each channel, photographs cannot separate the "
-        "scale of the light from that of the albedo."
+        "Spheres are seen from +X, with +Z up. The brightness of each channel is unknown, "
+        "because photographs cannot tell a bright light from a bright albedo."
     )
     return paragraph(found.about) + gallery(tiles, legend, "light")
 
@@ -381,7 +381,7 @@ def training_section(run: Path, state: dict[str, Any]) -> str:
     cfg = configuration(run)
     if cfg is None:
         return "\n".join(
-            [*parts, paragraph("The stages are missing: config.json could not be read.")]
+            [*parts, paragraph("The table of stages is missing: config.json is not readable.")]
         )
     rows = []
     if (before := prepared(state)) is not None:

@@ -221,11 +221,11 @@ def found_light(scene: Scene, mesh: Mesh) -> FoundLight | None:
         return None
     about = (
         f"This run has no environment map: its light is local ({scene.cfg.light.kind}) and "
-        "differs from point to point. The map shows the mean light of the points that face each "
-        "direction, which includes shadows of the object on itself."
+        "differs from point to point. For each direction, the map shows the mean light at the "
+        "points that face it, which includes shadows that the object casts on itself."
     )
     if scene.cfg.turntable is not None:
-        about += " It is fixed to the room around the turntable."
+        about += " The map is fixed to the room around the turntable."
     return FoundLight(local_map(scene, mesh), about)
 
 

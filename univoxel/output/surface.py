@@ -63,7 +63,7 @@ def surface_of(scene: Scene, cameras: Cameras | None = None) -> Mesh:
     mesh = smoothed(mesh, seen, REACH * scene.field.voxel_size)
     assert mesh.seen is not None
     if guess := float((mesh.seen < 0.5).float().mean()):
-        log.info("mesh: smoothed the %.1f %% of it that no photograph shows", 100 * guess)
+        log.info("mesh: smoothed the %.1f %% of the surface that no photograph shows", 100 * guess)
     return mesh
 
 

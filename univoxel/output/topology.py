@@ -92,7 +92,7 @@ def close(mesh: Mesh) -> Mesh:
     seen = None if mesh.seen is None else torch.cat([mesh.seen, torch.zeros(len(loops))])
     mesh = _mesh(vertices, faces, seen)
     if bad := open_edges(mesh):
-        raise UserError(f"the mesh cannot be made watertight: {bad} edges do not join two faces")
+        raise UserError(f"the mesh cannot be closed: {bad} edges do not join exactly two faces")
     return mesh
 
 

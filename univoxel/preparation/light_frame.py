@@ -181,7 +181,7 @@ def light_frame_of(
         if turntable is None:
             raise DataError(
                 f"{photos.folder}: light_frame=turntable needs cameras around one upright axis, "
-                "but these are not, so the axis of the turntable is unknown",
+                "but these are placed differently, so the axis of the turntable is unknown",
                 "light_frame",
             )
         return LightFrame(turntable)
@@ -199,8 +199,8 @@ def light_frame_of(
         lit = 2 * flashed.saved > found.saved
     if lit:
         log.info(
-            "light: a flash at the camera, which explains %.0f %% more of the colour changes "
-            "between photographs than a fixed light; light_frame overrides this",
+            "light: there is a flash at the camera. It explains %.0f %% more of the colour changes "
+            "between photographs than a fixed light does; light_frame overrides this",
             100 * flashed.saved,
             extra={"arguments": ("light_frame",)},
         )
@@ -210,9 +210,9 @@ def light_frame_of(
     assert turntable is not None
     assert found is not None
     log.info(
-        "light: it rotates with the camera, as on a turntable%s, which explains %.0f %% of the "
+        "light: it rotates with the camera, as on a turntable%s. This explains %.0f %% of the "
         "colour changes between photographs (a fixed light: %.0f %%); light_frame overrides this",
-        f", with {len(turntable.tables)} positions of the object" if turntable.others else "",
+        f" with {len(turntable.tables)} positions of the object" if turntable.others else "",
         100 * found.by_turning_light,
         100 * max(found.by_still_light, 0.0),  # none, where the other half contradicts it
         extra={"arguments": ("light_frame",)},
@@ -361,7 +361,7 @@ def varied_light(photos: Photos, hull: Tensor, grid: GridShape, gains: Tensor | 
     saved = (costs[0] - costs[1])[compared]
     ahead = ahead_by(saved, view[compared])
     told = [round(float(cost[compared].mean()), 3) for cost in costs]
-    log.debug("light: gains leave %s, a light for each photograph %s, ahead by %s", *told, ahead)
+    log.debug("light: cost %s with gains, %s with a light per photograph; z score %s", *told, ahead)
     enough = saved.sum() > VARIED_SHARE * costs[0].sum()
     return float(saved.mean()) if enough and ahead is not None and ahead > CERTAIN else 0.0
 

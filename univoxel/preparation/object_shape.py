@@ -222,8 +222,8 @@ def nothing_inside(box: Tensor, what: str, cameras: Cameras) -> UserError:
     """What to raise where the box [2, 3] is in the wrong place."""
     return UserError(
         f"box: expected a box around the object, got {words_of(box.flatten().tolist())}, in "
-        f"which {what}; the cameras look at {words_of(looked_at(cameras).tolist())}, and half of "
-        f"them show the cube that extends {reach(cameras):.4g} from there in each direction",
+        f"which {what}; the cameras look at {words_of(looked_at(cameras).tolist())}, and at least "
+        f"half of them see the cube that extends {reach(cameras):.4g} in each direction from there",
         "box",
     )
 
@@ -251,7 +251,7 @@ def find_object(
     if box is not None and share.max() < AROUND:
         raise nothing_inside(box, "most masks do not overlap", cameras)
     if not float(share.max()):
-        raise UserError("the masks overlap in no part of the scene: check masks and cameras")
+        raise UserError("the masks do not overlap anywhere in space: check masks and cameras")
     coarse = around(first, share >= AROUND * share.max(), FIRST_VOXELS**3, 0)
     found = votes(shown, maps, coarse)
     share = in_box(share_of(found, len(masks)), coarse, box)

@@ -212,7 +212,7 @@ def registered_poses(distance: Tensor, cameras: Cameras, box: tuple[Tensor, Tens
     result = "agree"
     if rest > MAX_CONTRADICTION:
         result = f"are still inconsistent by {rest:.1f} pixels"
-    log.info("camera poses refined by %.1f pixels on average: silhouettes %s", moved, result)
+    log.info("camera poses refined by %.1f pixels on average; the silhouettes %s", moved, result)
     return poses
 
 

@@ -71,7 +71,7 @@ def doubt_masks(photos: Photos, distance: Tensor, belief: Belief) -> Doubted:
     off = contradiction(distance, cameras, box, pixels)
     told = "the other masks (depth is ignored, because it disagrees with most masks)"
     if shape.surface:
-        told = "the other masks and the depth of the photographs, which covers "
+        told = "the other masks and the depth, which is known for "
         told += f"{shape.surface:.0%} of the surface"
     log.info(
         "%.1f%% of the pixels are uncertain, because a mask differs from %s",

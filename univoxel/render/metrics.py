@@ -147,7 +147,7 @@ def chamfer(points: Tensor, truth: Tensor) -> float:
         ValueError: a set is empty.
     """
     if not len(points) or not len(truth):
-        raise ValueError(f"chamfer: expected points, got {len(points)} and {len(truth)}")
+        raise ValueError(f"chamfer: both sets need points, got {len(points)} and {len(truth)}")
     a, b = points.double().numpy(), truth.double().numpy()
     there, _ = KDTree(b).query(a)
     back, _ = KDTree(a).query(b)
@@ -178,7 +178,7 @@ def sample_mesh(mesh: Mesh, count: int, generator: torch.Generator) -> Tensor:
     area = torch.linalg.cross(b - a, c - a).norm(dim=1)
     total = area.cumsum(0)
     if not len(total) or not total[-1] > 0:
-        raise ValueError(f"sample_mesh: expected a mesh with area, got {len(area)} triangles")
+        raise ValueError(f"sample_mesh: expected a mesh with area > 0, got {len(area)} triangles")
     u = torch.rand(count, 3, generator=generator, dtype=torch.float64)
     face = torch.searchsorted(total, u[:, 0] * total[-1], right=True).clamp_max(len(area) - 1)
     root = u[:, 1:2].sqrt()  # Turk 1990, "Generating random points in triangles"

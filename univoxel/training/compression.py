@@ -163,7 +163,7 @@ def fewer_mirror_levels_(scene: Scene, held_out: ReferenceRays) -> CapacityChoic
     _restore_(states[levels])
     why = f"costs {losses[levels]:.3f} dB"
     if fewer := [n for n in losses if n < levels]:
-        why += f", {max(fewer)} would cost {losses[max(fewer)]:.3f} dB"
+        why += f", but {max(fewer)} levels would cost {losses[max(fewer)]:.3f} dB"
     return CapacityChoice("mirror levels", full, levels, losses[levels], why)
 
 
@@ -308,8 +308,8 @@ def check_budget(scene: Scene, budget_mb: float) -> None:
     least = _bytes_apart_from_grid(scene) + FEWEST_VOXELS // 2 * _node_bytes(scene)
     if 1e6 * budget_mb < least:
         raise UserError(
-            f"budget_mb must be at least {least / 1e6:.2g} to hold networks, environment map and "
-            f"the coarsest grid, got {budget_mb:g}",
+            f"budget_mb must be at least {least / 1e6:.2g} to hold the networks, the environment "
+            f"map and the coarsest grid, got {budget_mb:g}",
             "budget_mb",
         )
 
@@ -374,8 +374,8 @@ def shortest_reach(scene: Scene, held_out: ReferenceRays) -> CapacityChoice:
     voxels = scene.field.sdf.detach().abs() / scene.field.voxel_size
     stored_nodes, shell_nodes = int((voxels < reach).sum()), int((voxels < SHELL).sum())
     why = (
-        f"{stored_nodes:,} of {voxels.numel():,} nodes are stored instead of {shell_nodes:,}; "
-        f"costs {losses[reach]:.3f} dB"
+        f"{stored_nodes:,} of {voxels.numel():,} nodes are stored instead of {shell_nodes:,}, "
+        f"which costs {losses[reach]:.3f} dB"
     )
     return CapacityChoice("reach", SHELL, reach, losses[reach], why)
 

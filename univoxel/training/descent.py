@@ -134,8 +134,8 @@ class Guard:
         if kind != self._kind:
             self._best, self._kind = -math.inf, kind
         if not psnr > self._best - FAR:  # NaN too
-            best = f", {self._best:.1f} dB at best" if math.isfinite(self._best) else ""
-            self._fail(f"validation PSNR is {psnr:.1f} dB{best}", True, "there is no earlier state")
+            best = f" (best: {self._best:.1f} dB)" if math.isfinite(self._best) else ""
+            self._fail(f"validation PSNR is {psnr:.1f} dB{best}", True, "found no earlier state")
             return
         self._best = min(max(self._best, psnr), ENOUGH)
         if psnr > self._best - FAR / 2:
@@ -169,7 +169,7 @@ class Guard:
             self._progress.clock.abandon()
             return
         done = "returned to the last good state" if back else otherwise
-        self._progress.trouble(f"{where}; {done}, step size multiplied by {self.scale:g}")
+        self._progress.trouble(f"{where}; {done}; the step size was multiplied by {self.scale:g}")
 
 
 # When validation pixels do not improve any more.

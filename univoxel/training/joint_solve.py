@@ -161,7 +161,7 @@ def traced_problem(
         scene.occluder()
         return build_problem(scene, photos, replace(cfg, points=points), seed)
     except NoSurface as error:  # there is none, or none that is seen
-        progress.trouble(f"stage {progress.clock.stage + 1}: {error}: kept light and materials")
+        progress.trouble(f"stage {progress.clock.stage + 1}: {error}: light and materials are kept")
         return None
 
 
@@ -249,7 +249,7 @@ def start_(
     if decisions.only_metal and cfg.only_metal is None:
         progress.say(
             "the whole object is classified as metal, because that explains the photographs "
-            "about as well as anything else; if it is not, use --metal some"
+            "about as well as a mix of materials; if parts are not metal, use --metal some"
         )
     if not cfg.colors:
         return decisions

@@ -182,7 +182,7 @@ class Panel:
         room = 0.02 * (high - low).norm()
         low, high = low - room, high + room
         self._boxed = gui.add_checkbox(
-            "box", False, hint="drag its corners; click on the object to move its bottom there"
+            "box", False, hint="drag the corners, or click on the object to move the bottom there"
         )
         self._option = gui.add_markdown("", visible=False)
         self._corners = [

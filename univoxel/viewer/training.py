@@ -68,7 +68,7 @@ def _guard(server: Any, host: str) -> None:
     """Answer pages of this server only, and tell nobody outside of it."""
 
     def refused(*args: Any, **options: Any) -> None:
-        log.warning("refused a page that asked to share the viewer with the network")
+        log.warning("refused the request of a page to share the viewer on the internet")
 
     server.request_share_url = refused  # would open a tunnel to a host outside
     inner = server._websock_server
@@ -78,7 +78,7 @@ def _guard(server: Any, host: str) -> None:
         websocket = inner._live_connections[connection.client_id]
         headers = websocket.request.headers
         if not same_site(headers.get("Origin"), headers.get("Host"), host):
-            log.warning("refused a page of %s that asked for the viewer", headers.get("Origin"))
+            log.warning("refused a page of %s that tried to use the viewer", headers.get("Origin"))
             await websocket.close(1008, "another site")
 
 
@@ -126,7 +126,7 @@ def _silent() -> Iterator[None]:
 SIZE = 192  # pixels along a picture, at most
 EVERY = 3.0  # seconds between pictures, at least
 SHARE = 0.05  # of the time that pictures may take; the longer one takes, the rarer they are
-ENDING = "Ending early: the remaining stages are shortened."
+ENDING = "Training ends early: the remaining stages are shortened."
 BEHIND = 32  # of 255, around the pictures
 
 
@@ -187,7 +187,7 @@ class Spectators:
         and somebody looks. The scene and the random numbers stay as they are."""
         if self._asked.is_set() and not clock.finished:
             clock.finish()
-            log.info("training is ended early: the remaining stages are shortened")
+            log.info("training ends early: the remaining stages are shortened")
         if self._failed or time.monotonic() < self._next:
             return
         begin = time.monotonic()
