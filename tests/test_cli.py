@@ -256,7 +256,7 @@ def test_info(calls, capsys):
 def test_train_does_not_overwrite_a_run(calls, tmp_path, capsys):
     (tmp_path / "scene.safetensors").touch()
     assert main(["train", "photos", "--out", str(tmp_path)]) == 2
-    assert "holds a run already: add --resume" in capsys.readouterr().err
+    assert "already contains a run: add --resume" in capsys.readouterr().err
     assert main(["train", "photos", "--out", str(tmp_path), "--resume"]) == 0
     assert calls.noted[0][2] == {"resume": True, "timelapse": None, "view": None}
     film = ["--timelapse", "frames/"]

@@ -258,7 +258,7 @@ def train(
 
     Raises:
         UserError: an argument or the data cannot be used.
-        ExistingFile: out holds a run already and resume is False.
+        ExistingFile: out already contains a run and resume is False.
         Cancelled: on_progress raised it.
         OSError: a file of the run cannot be written; earlier files are unchanged.
     """

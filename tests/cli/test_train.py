@@ -300,7 +300,7 @@ def test_resume_refuses_another_configuration(run, data):
 
 
 def test_a_run_is_not_overwritten(run, data):
-    with pytest.raises(FileExistsError, match="holds a run already: pass resume"):
+    with pytest.raises(FileExistsError, match="already contains a run: pass resume"):
         train(config(data, run))
 
 
@@ -323,7 +323,7 @@ def test_a_training_says_how_it_came_out(data, tmp_path, caplog):
     assert verdict.evidence.psnr > 10
     assert (run / "trust.txt").read_text().startswith(verdict.sentence() + ". ")
     assert any(message.startswith("Result: ") for message in caplog.messages)
-    assert "12 photographs of 0.001 MP: training takes about" in caplog.text
+    assert "12 photographs of 0.001 megapixels: training takes about" in caplog.text
 
 
 def test_a_limit_may_be_enough_for_the_steps_alone(caplog):
@@ -347,7 +347,9 @@ def test_a_stage_without_a_step_is_said_and_ends_with_code_3(data, tmp_path, mon
     assert main(["train", str(data), *options]) == 3
     said = capsys.readouterr().out
     assert "the time limit was too short (completed steps: 0% of" in said
-    assert "--minutes 0.0001 is enough for about 0% of the steps; --minutes 1 is enough" in said
+    assert (
+        "--minutes 0.0001 allows about 0% of the steps; to run all steps, use --minutes 1" in said
+    )
     verdict = load_verdict(tmp_path / "run")
     assert verdict.empty
     assert verdict.remedies[0] == "train with `--minutes 1`"

@@ -156,7 +156,7 @@ def test_what_was_cut_is_told(tmp_path, clock):
     assert progress.state()["made"] == progress.clock.made
     assert progress.clock.pace == progress.clock.made[1]
     assert progress.clock.short() == {"shape": progress.clock.made[1]}
-    cut = "the time limit ended the training early (completed steps: 50% of shape)"
+    cut = "training ended at the time limit (completed steps: 50% of shape)"
     assert progress.clock.cut() == cut
     assert progress.clock.minutes_for_all() == pytest.approx((1 + 2 * 55) / 60, abs=0.05)
 

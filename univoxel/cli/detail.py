@@ -49,11 +49,11 @@ class DetailOptions:
 def command(asked: DetailOptions) -> Path | None:
     """Add a texture from full-size photographs to a run.
 
-    Writes RUN/detail, or nothing if the photographs are no finer than the run's grid.
+    Writes RUN/detail, unless the photographs show no more detail than the grid of the run.
 
     Raises:
         UserError: the run or its photographs cannot be read, or there is no surface.
-        OSError: it cannot be written.
+        OSError: the texture cannot be written.
     """
     from univoxel.run import photos_of
     from univoxel.scene import load_scene
@@ -62,7 +62,9 @@ def command(asked: DetailOptions) -> Path | None:
     data = None if asked.data is None else Path(asked.data)
     made = write(load_scene(run), photos_of(run, data, "train"), run, asked.size)
     if made is None:
-        log.info("%s: no texture added, because photographs are no finer than the grid", run)
+        log.info(
+            "%s: no texture added, because the photographs show no more detail than the grid", run
+        )
     return made
 
 
@@ -109,7 +111,10 @@ def made_after_training(
     if detail == "none":
         return None
     if until is not None and time.monotonic() > until:
-        log.info("detail: no time was left for the texture; add it with `univoxel detail %s`", run)
+        log.info(
+            "detail: no time was left for the texture; to add it, run `univoxel detail %s`",
+            run,
+        )
         return None
     try:
         return write(scene, photos, run)

@@ -143,7 +143,7 @@ def command(asked: Train) -> int:
     watched = {"timelapse": asked.timelapse, "view": asked.view_at()}
     if not asked.resume and (Path(asked.out) / "scene.safetensors").exists():
         raise ExistingFile(
-            f"{asked.out} holds a run already: add --resume, or choose another --out"
+            f"{asked.out} already contains a run: add --resume, or choose another --out"
         )
     run = train(asked.configuration(), resume=asked.resume, **watched)
     print(run if asked.no_page else with_page(run))

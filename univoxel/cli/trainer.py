@@ -72,7 +72,7 @@ def train(
         MissingExtra: view without viser.
         MissingNative: the compiled extension is missing or was built without Embree.
         DataError: input that cannot be used.
-        ExistingFile: cfg.out holds a run already and resume is False.
+        ExistingFile: cfg.out already contains a run and resume is False.
         OSError: a file of the run cannot be written; what was there before stays.
         UserError: with resume, the checkpoint cannot be read, or it belongs to another
             configuration; or training needs more memory than there is; or the port is taken.
@@ -102,7 +102,7 @@ def _train(
     torch.manual_seed(cfg.seed)
     if not resume and (cfg.out / FILE).exists():
         raise ExistingFile(
-            f"{cfg.out} holds a run already: pass resume, or choose another folder for out",
+            f"{cfg.out} already contains a run: pass resume, or choose another folder for out",
             *("resume", "out"),
         )
     kept, outside = kept_photos(cfg.out, "train"), cfg.allow_outside
@@ -251,20 +251,20 @@ def announce(progress: Progress, photos: Photos) -> None:
     steps = before + clock.planned + RESERVE_SECONDS
     whole = steps + clock.afterwards
     size = photos.downscale**2 * pixels / len(photos)
-    what = f"{len(photos)} photographs of {size:.2g} MP"
+    what = f"{len(photos)} photographs of {size:.2g} megapixels"
     clock.preparation = min(before, config.PREPARATION * clock.limit)
     if steps <= clock.limit:
         log.info(f"{what}: training takes about {duration(whole)} on this machine")
         return
     fits = max(clock.limit - clock.preparation - RESERVE_SECONDS, 0.0) / clock.planned
     said = f"{what}: training takes about {duration(whole)} on this machine"
-    said += f"; minutes={cfg.minutes:g} is enough "
+    said += f"; minutes={cfg.minutes:g} allows "
     if fits < 1:
-        said += f"for about {fits:.0%} of the steps"
+        said += f"about {fits:.0%} of the steps"
     else:
-        said += f"for all steps if preparation takes at most {duration(clock.preparation)}"
+        said += f"all steps, if preparation takes at most {duration(clock.preparation)}"
     if fits < LEAST:
-        said += f"; minutes={math.ceil(whole / 60)} is enough for all of them"
+        said += f"; to run all steps, use minutes={math.ceil(whole / 60)}"
     log.info(said, extra={"arguments": ("minutes",)})
 
 
@@ -357,7 +357,7 @@ def trusted(scene: Scene, photos: Photos) -> Survey | None:
     try:
         return survey(scene, photos, REPORT_POINTS)
     except UserError as error:
-        log.info(f"no expected errors are told: {error}")
+        log.info(f"expected errors are missing: {error}")
         return None
 
 

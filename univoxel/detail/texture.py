@@ -250,7 +250,7 @@ def make_detail(scene: Scene, photos: Photos, size: int | None = None) -> Detail
     voxel, middle = scene.field.voxel_size, torch.stack(scene.field.bounds()).mean(0)
     pixel = pixel_width(photos.cameras, middle) / photos.downscale
     if not photos.readers or voxel < PIXELS_OF_VOXEL * pixel:
-        log.debug("detail: no texture added, because photographs are no finer than the grid")
+        log.debug("detail: no texture added, because photographs show no more detail than the grid")
         return None
     mesh = surface_of(scene, photos.cameras)
     mesh = simplify(mesh, min(FACES, len(mesh.faces)))
@@ -265,13 +265,16 @@ def make_detail(scene: Scene, photos: Photos, size: int | None = None) -> Detail
     errors = torch.tensor([baking.errors(*read) for read in _read(photos, held)])  # [H, 2]
     before, after = errors.nanmean(0).tolist() if len(held) else (math.nan, math.nan)
     if not after < before:
-        log.info("detail: no texture added, because it would not predict photographs better")
+        log.info(
+            "detail: no texture added, because it would not improve the prediction of photographs"
+        )
         return None
     for view, picture in _read(photos, held):
         baking.add(view, picture)
     gain = -10 * math.log10(after / before)
     log.info(
-        "detail: a texture of %d x %d from %d photographs, which predicts others %.1f dB better",
+        "detail: made a texture of %d x %d texels from %d photographs, which improves the "
+        "prediction of other photographs by %.1f dB",
         *(atlas.size, atlas.size, len(photos), gain),
     )
     albedo = baking.picture()
@@ -463,11 +466,11 @@ def load_detail(run: str | Path) -> Detail | None:
             tensors = {name: file.get_tensor(name) for name in file.keys()}
         if about.get("format") != FORMAT:
             came = f"{about.get('format')!r:.40}"
-            raise DataError(f"{path}: expected detail in format {FORMAT}, got {came}; {remedy}")
+            raise DataError(f"{path}: expected a texture in format {FORMAT}, got {came}; {remedy}")
         if about["checkpoint"] != _fingerprint(Path(run)):
             raise DataError(f"{path}: made for another checkpoint than {CHECKPOINT}; {remedy}")
         if about["picture"] != _digest(picture):
-            raise DataError(f"{picture}: not the file that was written with {MESH}; {remedy}")
+            raise DataError(f"{picture}: does not belong to {MESH}; {remedy}")
         albedo = torch.from_numpy(np.array(Image.open(picture).convert("RGB")))
         detail = Detail(**tensors, albedo=albedo, reach=float(about["reach"]))
         _check(detail)

@@ -326,8 +326,12 @@ class Clock:
         if not (short := self.short()):
             return ""
         stages = ", ".join(f"{made:.0%} of {name}" for name, made in short.items())
-        why = "the training was stopped" if self.finished else "the time limit ended the training"
-        return f"{why} early (completed steps: {stages})"
+        why = (
+            "the training was stopped early"
+            if self.finished
+            else "training ended at the time limit"
+        )
+        return f"{why} (completed steps: {stages})"
 
     def minutes_for_all(self) -> float:
         """Minutes in which all steps would have been made, as those that were made went."""

@@ -173,7 +173,8 @@ class Progress:
         if not needed and self.clock.hurried and not self._goes_on:
             self.skipped.append(what)
             log.info(
-                f"minutes leaves no time for a step: {what}", extra={"arguments": ("minutes",)}
+                f"minutes is too short for a step of the preparation, which is skipped: {what}",
+                extra={"arguments": ("minutes",)},
             )
         return what not in self.skipped
 
