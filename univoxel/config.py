@@ -98,7 +98,7 @@ class LossConfig:
     silhouette: float = setting(0.1, "difference between ray opacity and masks", least=0)
     metallic: float = setting(0.01, "penalty on the mean metallic value", least=0)
     light_smoothness: float = setting(
-        0.1, "L1 norm of the change of local light per voxel", least=0
+        0.1, "L1 norm of the difference of local light between neighbouring voxels", least=0
     )
     white_light: float = setting(0.01, "relative distance of the mean light from grey", least=0)
     map_smoothness: float = setting(1e-3, "total variation of the log environment map", least=0)
@@ -131,7 +131,7 @@ class JointConfig:
     rounds: int = setting(4, "number of rounds: Newton steps on the map, then Adam steps", least=1)
     points: int = setting(20400, "number of surface points", least=1)
     tracing: int = setting(2, "visibility rays per point and direction", least=1)
-    colors: bool = setting(True, "whether to minimise the entropy of the albedo; see entropy")
+    colors: bool = setting(True, "whether to minimise the entropy of the albedo")
     only_metal: bool | None = setting(
         None, "whether the whole object is metal; None: a multi-start initialisation decides"
     )

@@ -38,7 +38,7 @@ class TrainOptions:
     metal: Annotated[choices.Metal, parsing.ADVANCED] = "auto"
     """all: the whole object is metal, even with patina; some: it is not; auto: detect"""
     detail: choices.DetailingOrAuto = "auto"
-    """texture: refine the albedo from full-size photographs; auto: not for draft"""
+    """texture: refine the albedo from full-size photographs; auto: except with draft"""
     masks: choices.MasksFrom = "auto"
     """auto: erode masks that extend past the object's edge; given: use them unchanged"""
     cameras: choices.CamerasFrom = "auto"

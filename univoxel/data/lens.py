@@ -70,7 +70,7 @@ def checked(lens: Lens) -> Lens:
             f"{lens.width}x{lens.height}, got {x:.4g} and {y:.4g}"
         )
     if not all(abs(at) <= high for at in lens.centre):
-        raise UserError(f"expected a principal point within {high:.4g} pixels, got {lens.centre}")
+        raise UserError(f"principal point: expected at most {high:.4g} pixels, got {lens.centre}")
     if not all(abs(k) <= STRONGEST for k in (*lens.radial, *lens.tangential)):
         raise UserError(
             f"expected distortion coefficients up to {STRONGEST:.0e}, got "

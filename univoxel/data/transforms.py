@@ -155,8 +155,8 @@ def read_frames(path: Path) -> tuple[dict[str, Any], list[load_images.Shot], lis
         c > OFF * n for c, n in zip(first.centre, (first.width, first.height), strict=True)
     ):
         log.warning(
-            "%s: cx and cy are at the border of the %dx%d images: if they refer to larger "
-            "images, add that size as w and h",
+            "%s: cx and cy are near or beyond the border of the %dx%d images; if they refer to "
+            "larger images, add the width and height of those as w and h",
             *(path, first.width, first.height),
         )
     lost += [f"{scaled} cameras scaled to smaller images"] if scaled else []

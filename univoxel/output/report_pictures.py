@@ -215,7 +215,7 @@ def found_light(scene: Scene, mesh: Mesh) -> FoundLight | None:
     if sky is not None:
         about = "The recovered environment map."
         if scene.flash is not None:
-            about += " In addition, a flash at the camera lit the photographs."
+            about += " A flash on the camera also lit the object."
         return FoundLight(scene.exposed(sky.latlong(ROWS)), about)
     if not isinstance(scene.light, AbstractLocalLight):
         return None
