@@ -14,6 +14,7 @@ from observed_points import (
     photographs_under,
     problem_on_a_sphere,
     random_problem,
+    sphere_of,
 )
 from plain import plain_stage, plain_training
 from torch.nn.functional import normalize
@@ -27,7 +28,7 @@ from univoxel.render.observations import MaterialLabels, Mirrors, prefiltered_ro
 from univoxel.render.pipeline import extract_mesh
 from univoxel.scene import SceneConfig, load_checkpoint
 from univoxel.training import joint_solve, progress
-from univoxel.training.newton import NewtonRound
+from univoxel.training.newton import NewtonRound, newton_round_
 
 CFG = JointConfig(newton_points=400, newton_views=8, newton_steps=6)
 
@@ -245,7 +246,7 @@ def events(monkeypatch):
 def within(**known) -> Steps:
     """A training that goes on in its second round."""
     told = Steps(4)
-    told.within = asdict(joint_solve.Round(0.0, 0.5, rounds_after=1, solved=True, **known))
+    told.within = asdict(joint_solve.Within(0.0, 0.5, rounds_after=1, solved=True, **known))
     return told
 
 
@@ -448,3 +449,47 @@ def test_a_refit_leaves_materials_bit_for_bit(tmp_path, monkeypatch):
     assert not torch.equal(formed["field.sdf"], before["field.sdf"])
     assert not torch.equal(formed["field.features"], before["field.features"])
     assert not torch.equal(formed["sky.log_radiance"], before["sky.log_radiance"])
+
+
+@pytest.mark.parametrize(
+    ("metal", "evidence", "wanted", "share"),
+    [
+        (False, 0.0, joint_solve.ORDINARY, 1.0),  # nothing tells: an ordinary albedo
+        (False, joint_solve.LEVEL, joint_solve.ORDINARY, 0.5),  # halfway, in logarithms
+        (False, 1e3, joint_solve.ORDINARY, 0.0),  # photographs tell
+        (True, 1e3, joint_solve.ORDINARY_METAL, 1.0),  # they never do
+    ],
+)
+def test_the_level_of_light_and_albedo(metal, evidence, wanted, share):
+    """What photographs show, the product of map and albedo, stays."""
+    scene, problem = sphere_of((0.1, 0.1, 0.1), 0.5, 0.5)
+    features = scene.field.features_at(problem.observations.position)
+    with torch.no_grad():
+        scene.material.shift_albedo(features, torch.full((3,), 0.1))
+        before = scene.material(features)[0]
+        shown = scene.sky.radiance * before.median(0).values
+        every = torch.full((len(features),), metal)
+        joint_solve.set_level_(scene, problem, every, evidence)
+        albedo = scene.material(features)[0]
+    torch.testing.assert_close(scene.sky.radiance * albedo.median(0).values, shown)
+    expected = wanted**share * before.mean() ** (1 - share)
+    torch.testing.assert_close(albedo.mean(), expected, rtol=0.01, atol=0)
+
+
+def test_bright_albedo_stays():
+    scene, problem = sphere_of((0.1, 0.1, 0.1), 0.5, 0.5)
+    features = scene.field.features_at(problem.observations.position)
+    with torch.no_grad():
+        before = scene.material(features)[0]
+        joint_solve.set_level_(scene, problem, torch.zeros(len(features), dtype=torch.bool), 0.0)
+        assert before.mean() > joint_solve.ORDINARY
+        torch.testing.assert_close(scene.material(features)[0], before)
+
+
+def test_highlights_tell_the_level_and_roughness_hides_it():
+    levels = {}
+    for roughness in (0.2, 0.9):
+        scene, problem = sphere_of((0.3, 0.3, 0.3), 0.0, roughness)
+        every = MaterialLabels(torch.zeros(len(problem.observations.position), dtype=torch.bool))
+        levels[roughness] = newton_round_(scene, problem, every, CFG).level
+    assert levels[0.2] > 5 * levels[0.9] > 0

@@ -76,9 +76,11 @@ def _placed(folder: Path, pictures: list[Path]) -> list[Path]:
 def _rows(path: Path) -> np.ndarray:
     rows = read_npy(path)
     if rows.ndim != 2 or rows.shape[1] != COLUMNS:
-        raise DataError(f"{path}: expected {COLUMNS} numbers in each row, got {np.shape(rows)}")
+        raise DataError(f"{path}: expected {COLUMNS} numbers a row, got {np.shape(rows)}")
     if rows.dtype.kind not in "fiu" or not len(rows):
-        raise DataError(f"{path}: expected {COLUMNS} numbers in each row, got {len(rows)} x {rows.dtype}")
+        raise DataError(
+            f"{path}: expected {COLUMNS} numbers in each row, got {len(rows)} x {rows.dtype}"
+        )
     return rows.astype(np.float64)
 
 

@@ -180,7 +180,9 @@ class Differentiable(native.Operator):
         outputs = get_args(hints["return"]) or (Tensor,)
         lists = LIST in tensors.values()
         assert [*arguments] == [*tensors, *options], "tensors come before options"
-        assert not lists or to == [*tensors], "lists of tensors: `to` must name all tensor arguments"
+        assert not lists or to == [*tensors], (
+            "with lists, `to` must name all tensor arguments"
+        )
         self._to = [[*tensors].index(n) for n in to]
         self._count, self._tensors = len(arguments), len(tensors)
         self._held, self._shown = held, len(outputs) - held

@@ -67,6 +67,7 @@ class NewtonRound:
 
     costs: list[float] = field(default_factory=list)  # mean weighted squared residual by step
     unseen: float = math.inf  # mean robust cost of observations that were not used; inf: of none
+    level: float = 0.0  # second derivative of the cost by the log brightness of the whole map
     troubles: list[str] = field(default_factory=list)  # sentences about what had no solution
 
 
@@ -168,7 +169,7 @@ def newton_round_(
     laplacian = cfg.newton_smooth * equations.graph_laplacian(
         problem.sky.direction, NODE_NEIGHBOURS
     )
-    costs = []
+    costs, level = [], 0.0
     for _ in range(cfg.newton_steps):
         differences = equations.view_differences(scene)
         if differences is not None and differences.basis is not None:
@@ -176,13 +177,14 @@ def newton_round_(
                 return NewtonRound(costs, troubles=[UNSOLVABLE])
             differences = equations.view_differences(scene)
         sun, damping = decisions.sun, cfg.newton_smooth
-        cost = map_step_(scene, points, differences, sun, laplacian, damping)
-        if cost is None:
+        made = map_step_(scene, points, differences, sun, laplacian, damping)
+        if made is None:
             return NewtonRound(costs, troubles=[UNSOLVABLE])
-        costs.append(cost)
+        costs.append(made[0])
+        level = made[1]
     if unseen is None:
-        return NewtonRound(costs)
-    return NewtonRound(costs, unseen_cost(scene, points, unseen))
+        return NewtonRound(costs, level=level)
+    return NewtonRound(costs, unseen_cost(scene, points, unseen), level)
 
 
 def unseen_cost(scene: Scene, points: NewtonPoints, unseen: JointProblem) -> float:
@@ -255,9 +257,9 @@ def map_step_(
     sun: Tensor | None,
     laplacian: Tensor,
     damping: float,
-) -> float | None:
+) -> tuple[float, float] | None:
     """Change the map, the views' gains and the points' materials by one step; return the cost
-    before it, or None if the equations have no solution and all stays.
+    before it and the `NewtonRound.level`, or None if the equations have no solution and all stays.
 
     Args:
         sun: [D, 3] what a sun adds to the log map: it is no want of smoothness.
@@ -288,6 +290,8 @@ def map_step_(
         coupling, gradient = coupling + hessian_part / count, gradient - gradient_part
         system, right_side = system + hessian / count, right_side + gradient / count
         eliminated.append(albedo)
+    brighter = (torch.arange(unknowns) < nodes).float().repeat(3)
+    level = float(brighter @ (torch.block_diag(*system) - coupling) @ brighter)
     system.diagonal(dim1=1, dim2=2).add_(damping)
     system, right_side = torch.block_diag(*system) - coupling, right_side.flatten()
     tied = None
@@ -311,7 +315,7 @@ def map_step_(
     if scene.flash is not None:
         scene.flash.log_radiance.add_(to_flash[0])
     points.step_(eliminated, step)
-    return sum(albedo.cost for albedo in eliminated) / count
+    return sum(albedo.cost for albedo in eliminated) / count, level
 
 
 def views_step_(
