@@ -327,13 +327,13 @@ class Choice:
 
 @dataclass(frozen=True)
 class Within:
-    """Where in a stage of rounds a run is, as `univoxel.training.joint_solve` has it."""
+    """A round of `univoxel.training.joint_solve`: Newton steps at its begin, and then Adam."""
 
-    begin: float
-    end: float
+    begin: float  # progress of the stage, [0, 1]
+    end: float  # the same
     rounds_after: int
-    solved: bool
-    only_metal: bool = False
+    solved: bool  # whether Newton has made a step
+    only_metal: bool = False  # as in `MaterialLabels`
 
     def __post_init__(self) -> None:
         check_fields(self, "in [0, 1]", lambda x: 0 <= x <= 1, "begin", "end")

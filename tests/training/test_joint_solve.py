@@ -245,7 +245,7 @@ def events(monkeypatch):
 def within(**known) -> Steps:
     """A training that goes on in its second round."""
     told = Steps(4)
-    told.within = asdict(joint_solve.Round(0.0, 0.5, rounds_after=1, solved=True, **known))
+    told.within = asdict(joint_solve.Within(0.0, 0.5, rounds_after=1, solved=True, **known))
     return told
 
 

@@ -10,7 +10,7 @@ and highlights determine better than silhouettes and colours did.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 
 import torch
 from torch import Tensor
@@ -36,7 +36,7 @@ from univoxel.render.observations import (
     shade_observations,
     with_present_normals,
 )
-from univoxel.scene import Scene, save_scene
+from univoxel.scene import Scene, Within, save_scene
 from univoxel.training.albedo_entropy import diffuse_albedo, fit_sun_, minimise_entropy_
 from univoxel.training.descent import EPS_FEATURES, EPS_SDF, MOMENTS, Guard, smooth_sdf_gradient_
 from univoxel.training.metals import (
@@ -82,17 +82,6 @@ ROUGHNESS_SMOOTHNESS = 0.02
 METALLIC_WEIGHT = 0.01
 
 
-@dataclass(frozen=True)
-class Round:
-    """A round: Newton steps at its begin, and then Adam."""
-
-    begin: float  # progress of the stage, [0, 1]
-    end: float  # the same
-    rounds_after: int
-    solved: bool  # whether Newton has made a step
-    only_metal: bool = False  # as in Decisions
-
-
 def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: Progress) -> None:
     """Fit scene.sky, the materials and the normals to the photographs; other heads stay.
 
@@ -108,9 +97,9 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
     decisions = first_labels(scene, problem, cfg)
     scene.field.sdf.requires_grad_(cfg.lr_sdf > 0)
     guard = Guard(progress)
-    current_round = Round(begin=0.0, end=-1.0, rounds_after=cfg.rounds, solved=False)
+    current_round = Within(begin=0.0, end=0.0, rounds_after=cfg.rounds, solved=False)
     if progress.within is not None:
-        current_round = Round(**progress.within)
+        current_round = Within(**progress.within)
         done = rounds_done(cfg, current_round.rounds_after)
         only_metal = decisions.only_metal or current_round.only_metal
         decisions = replace(decisions, only_metal=only_metal)
@@ -125,7 +114,7 @@ def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: P
             # On a slow machine fewer and longer rounds
             rounds_after = progress.clock.blocks_that_fit(rounds_left - 1)
             end = done + (1 - done) / (1 + rounds_after)
-            current_round = Round(done, end, rounds_after, solved, decisions.only_metal)
+            current_round = Within(done, end, rounds_after, solved, decisions.only_metal)
             progress.within = asdict(current_round)
             optimizer = adam(scene, problem)
             guard.follow(optimizer)
@@ -341,7 +330,7 @@ def adam(scene: Scene, problem: JointProblem) -> RowAdam:
 def set_rates_(
     optimizer: RowAdam,
     cfg: JointConfig,
-    current_round: Round,
+    current_round: Within,
     done: float,
     voxel_size: float,
     scale: float,
