@@ -14,6 +14,7 @@ from torch.nn.functional import grid_sample
 from univoxel.color import luminance
 from univoxel.core import log
 from univoxel.data.images import SUFFIXES, kind_of, read_image
+from univoxel.data.truth import map_file
 from univoxel.errors import DataError
 from univoxel.ops.integrator import EnvTables
 from univoxel.sphere import direction_to_latlong, rotate_z, texel_solid_angles
@@ -193,8 +194,5 @@ def read_map(path: Path) -> EnvMap:
 
 def true_map(data: Path) -> Tensor | None:
     """The true light of the photographs, if the data set has it."""
-    for suffix in (".hdr", ".exr"):
-        path = data / "envmaps" / f"train{suffix}"
-        if path.is_file():
-            return read_map(path).radiance
-    return None
+    path = map_file(data / "envmaps", "train")
+    return None if path is None else read_map(path).radiance

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import shutil
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -196,11 +196,16 @@ def cutout(
     }
     log.info(photos.about)
     if masked:
-        masks = _from_network(splits, timed(masked, network, sum(map(len, splits.values()))))
+        masked = timed(masked, network, sum(map(len, splits.values())))
+        masks = {
+            name: [_bytes(masked(_encoded(split, v))) for v in track(range(len(split)), "masks")]
+            for name, split in splits.items()
+        }
     elif origin == DEPTH:
         masks = _from_depth(splits, depth_maps(photos), corners, keep_table)
     else:  # of shrunk photographs those with masks are black outside of them
-        masks = _as_read({n: load(n, photos.downscale, masks=Path(origin)) for n in splits})
+        read = {n: load(n, photos.downscale, masks=Path(origin)) for n in splits}
+        masks = {n: [_bytes(s.picture(v)[1]) for v in range(len(s))] for n, s in read.items()}
     if origin == DEPTH:  # silhouettes have nothing to say against themselves
         verdicts, told = _as_they_are(masks), "masks from depth"
     else:
@@ -289,20 +294,6 @@ def _silhouettes_of(shape: object_shape.ObjectShape, photos: Photos) -> list[Ten
         fine = interpolate(away[None], size, mode="bilinear")[0, 0]
         found.append(_bytes((0.5 - fine).clamp(0, 1)))
     return found
-
-
-def _from_network(splits: dict[str, Photos], masked: Callable[[Tensor], Tensor]) -> Masks:
-    return {
-        name: [_bytes(masked(_encoded(split, v))) for v in track(range(len(split)), "masks")]
-        for name, split in splits.items()
-    }
-
-
-def _as_read(splits: dict[str, Photos]) -> Masks:
-    return {
-        name: [_bytes(split.picture(view)[1]) for view in range(len(split))]
-        for name, split in splits.items()
-    }
 
 
 def _as_they_are(masks: Masks) -> dict[str, list[Verdict]]:

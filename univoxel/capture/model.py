@@ -5,8 +5,8 @@ from __future__ import annotations
 import sqlite3
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from contextlib import closing
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -35,10 +35,8 @@ class Pair:
     kind: int  # configuration
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[sqlite3.Connection]:
-    with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as connection:
-        yield connection
+def _opened(path: Path) -> closing[sqlite3.Connection]:
+    return closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True))
 
 
 def count(path: Path, table: str) -> int:
@@ -207,19 +205,12 @@ def without(model: Model, numbers: set[int]) -> Model:
     kept = np.array([~np.isin(t["image"], list(numbers)) for t in p.tracks], object)
     tracks = [t[k] for t, k in zip(p.tracks, kept, strict=True)]
     some = np.array([len(np.unique(t["image"])) >= 2 for t in tracks], bool)
-    points = Points(
-        p.number[some],
-        p.position[some],
-        p.color[some],
-        p.error[some],
-        [t for t, s in zip(tracks, some, strict=True) if s],
-    )
+    tracks = [t for t, s in zip(tracks, some, strict=True) if s]
+    points = Points(p.number[some], p.position[some], p.color[some], p.error[some], tracks)
+    shown = [np.isin(i.point, points.number) for i in images]
     images = [
-        Placed(
-            *(i.number, i.camera, i.name, i.to_camera, i.xy),
-            np.where(np.isin(i.point, points.number), i.point, NO_POINT),
-        )
-        for i in images
+        replace(i, point=np.where(there, i.point, NO_POINT))
+        for i, there in zip(images, shown, strict=True)
     ]
     return Model(model.cameras, images, points)
 

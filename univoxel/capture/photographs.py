@@ -139,7 +139,10 @@ def describe(path: Path) -> Photograph:
     """Size and camera of a photograph, from its beginning only; a DataError if it is damaged."""
     try:
         if path.suffix.lower() in RAW:
-            return _describe_raw(path)
+            with _raw(path) as raw:
+                width, height = raw.sizes.width, raw.sizes.height
+                across = raw.sizes.flip in (5, 6)
+            return Photograph(path, *((height, width) if across else (width, height)))
         with _open(path) as image:
             exif = image.getexif()
             details = exif.get_ifd(DETAILS)
@@ -213,14 +216,6 @@ def _eight_bits(image: Image.Image) -> Image.Image:
         top = 65535 if array.max() > 255 else 255
         return Image.fromarray((array * (255 / top)).clip(0, 255).astype(np.uint8)).convert("RGB")
     return image.convert("RGBA" if image.has_transparency_data else "RGB")
-
-
-def _describe_raw(path: Path) -> Photograph:
-    with _raw(path) as raw:
-        width, height = raw.sizes.width, raw.sizes.height
-        if raw.sizes.flip in (5, 6):
-            width, height = height, width
-    return Photograph(path, width, height)
 
 
 def _develop(path: Path, longest: int) -> Image.Image:

@@ -98,7 +98,9 @@ def poses(
     require_readers(files)
     capture, unread = gather(files, masks)
     unread += others
-    log.info(in_words(capture.photographs, capture.groups) + _aside(unread, doubles))
+    told = in_words(capture.photographs, capture.groups)
+    told += f"; {doubles} exist in two formats, of which one is used" if doubles else ""
+    log.info(told + (f"; {len(unread)} could not be read: {_some(unread)}" if unread else ""))
     settings = _settings(source, masks, every, config, capture)
     used = {"keep_size": keep_size, "keep_weak": keep_weak}
     if _begin(out, folders, settings, used):
@@ -112,7 +114,7 @@ def poses(
     ) as progress:
         unreadable = _search(capture, folders, config, settings, progress)
         found = _judge(capture, folders, unreadable)
-        _say(capture, found, len(capture.photographs), keep_weak)
+        _say(capture, found, keep_weak)
         left_out = set() if keep_weak else set(found.weak)
         model = without(found.model, left_out) if left_out else found.model
         index = {name: i for i, name in enumerate(capture.pictures)}
@@ -215,18 +217,14 @@ def _begin(out: Path, folders: Folders, settings: dict, written: dict) -> bool:
             raise other
         return steps.recorded(folders.work, SCENE) == written
     if steps.recorded(folders.work, SEARCH) != steps.as_json(settings):  # and nothing came of it
-        _start_over(folders)
+        # All goes but the frames of a video
+        steps.forget(folders.work, SEARCH, *PARTS)
+        for path in (folders.pictures, folders.masks, folders.models):
+            shutil.rmtree(path, ignore_errors=True)
+        for path in (*folders.work.glob("database.db*"), folders.pairs):
+            path.unlink(missing_ok=True)
         steps.finish(folders.work, SEARCH, settings)
     return False
-
-
-def _start_over(folders: Folders) -> None:
-    """Remove all work but the frames of a video."""
-    steps.forget(folders.work, SEARCH, *PARTS)
-    for path in (folders.pictures, folders.masks, folders.models):
-        shutil.rmtree(path, ignore_errors=True)
-    for path in (*folders.work.glob("database.db*"), folders.pairs):
-        path.unlink(missing_ok=True)
 
 
 def _search(
@@ -251,7 +249,8 @@ def _search(
 
     do(FEATURES, structure.extract, total)
     do(PAIRS, structure.select, total)
-    do(MATCHES, structure.match, structure.pair_count(folders))
+    pairs = folders.pairs.read_text(encoding="utf-8").splitlines()
+    do(MATCHES, structure.match, len(pairs))
     still, matching = pose_validation.still(database.verified_pairs(folders.database))
     if still > STILL_SHARE * matching:
         stands = f"the background is static in {still} of {matching} pairs of photographs"
@@ -278,8 +277,14 @@ def _judge(capture: Capture, folders: Folders, unreadable: dict[int, str]) -> Fo
     numbers = database.images(folders.database)
     placed = {i.number: i for i in models[0].images} if models else {}
     elsewhere = {i.number: len(m.images) - 1 for m in reversed(models[1:]) for i in m.images}
-    errors = models[0].errors() if models else {}
-    weak = _weak(models[0], folders, errors) if models else {}
+    errors: dict[int, float] = {}
+    weak: dict[int, str] = {}
+    if models:
+        errors, images = models[0].errors(), models[0].images
+        matches, places = database.matches(folders.database), database.positions(folders.database)
+        others = pose_validation.partners(models[0], matches, places)
+        doubts = {i.number: pose_validation.doubt(models[0], i, errors[i.number]) for i in images}
+        weak = pose_validation.weak({i.number: i.points for i in images}, others, doubts)
     reports = []
     for index, name in enumerate(capture.pictures):
         photograph = capture.photographs[index].path.name
@@ -305,24 +310,16 @@ def _judge(capture: Capture, folders: Folders, unreadable: dict[int, str]) -> Fo
     return Found(models[0], weak, reports)
 
 
-def _weak(model: Model, folders: Folders, errors: dict[int, float]) -> dict[int, str]:
-    """Placed pictures whose poses are not trusted, and why."""
-    partners = pose_validation.partners(
-        model, database.matches(folders.database), database.positions(folders.database)
-    )
-    doubts = {i.number: pose_validation.doubt(model, i, errors[i.number]) for i in model.images}
-    return pose_validation.weak({i.number: i.points for i in model.images}, partners, doubts)
-
-
-def _say(capture: Capture, found: Found, total: int, keep_weak: bool) -> None:
+def _say(capture: Capture, found: Found, keep_weak: bool) -> None:
     """How many were placed, how well, and which not."""
     model, reports = found.model, found.reports
     lenses = [model.cameras[c] for c in sorted({i.camera for i in model.images})]
     shares = [f"{lens.focal[0] / lens.width:.2f}" for lens in lenses[:NAMED]]
     cameras = "one camera" if len(lenses) == 1 else f"{len(lenses)} cameras"
     log.info(
-        f"cameras: {len(model.images)} of {total} photographs registered, mean reprojection error "
-        f"{model.error:.2f} pixels, focal length {', '.join(shares)} times the width ({cameras})"
+        f"cameras: {len(model.images)} of {len(reports)} photographs registered, mean "
+        f"reprojection error {model.error:.2f} pixels, "
+        f"focal length {', '.join(shares)} times the width ({cameras})"
     )
     missing = [f"{r.name} ({r.reason})" for r in reports if not r.placed]
     if missing:
@@ -340,11 +337,6 @@ def _say(capture: Capture, found: Found, total: int, keep_weak: bool) -> None:
             f"{fate}: {_some(weak)}. Photograph that side of the object again with more overlap",
             extra={"arguments": ("keep_weak",)},
         )
-
-
-def _aside(unread: list[str], doubles: int) -> str:
-    told = f"; {doubles} exist in two formats, of which one is used" if doubles else ""
-    return told + (f"; {len(unread)} could not be read: {_some(unread)}" if unread else "")
 
 
 def _some(names: list[str]) -> str:

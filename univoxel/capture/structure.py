@@ -138,11 +138,6 @@ def match(capture: Capture, folders: Folders, config: CaptureConfig) -> Iterator
     )
 
 
-def pair_count(folders: Folders) -> int:
-    """Pairs to match."""
-    return len(folders.pairs.read_text(encoding="utf-8").splitlines())
-
-
 def place(capture: Capture, folders: Folders, config: CaptureConfig) -> Iterator[int]:
     """Find the cameras; yields how many photographs were placed, in all tries together."""
     shutil.rmtree(folders.models, ignore_errors=True)

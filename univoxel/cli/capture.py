@@ -194,7 +194,11 @@ def capture(
         scene = _find_cameras(project, given, asked, config)
         data = _find_masks(project, scene, asked)
         run = _train(replace(training, data=data.absolute(), out=project.run), on_progress)
-    _export(project, run)
+    if _up_to_date(project.mesh, run):
+        _skip("mesh", project.mesh)
+    else:
+        _say("mesh", str(project.mesh))
+        export(run, project.mesh)
     _picture(project, run, pictures)
     _say("page", str(project.page))
     _write_page(project, given, run)
@@ -471,14 +475,6 @@ def _check_trained(wanted: TrainConfig, done: bool) -> None:
             "train again, remove that folder or choose another folder for out",
             *("preset", "minutes", "light", "set", "out"),
         )
-
-
-def _export(project: Project, run: Path) -> None:
-    if _up_to_date(project.mesh, run):
-        _skip("mesh", project.mesh)
-    else:
-        _say("mesh", str(project.mesh))
-        export(run, project.mesh)
 
 
 def _up_to_date(file: Path, run: Path) -> bool:

@@ -66,9 +66,11 @@ def command(asked: DoctorOptions) -> None:
 def look() -> list[Finding]:
     """What was found of the installation and the machine."""
     import torch
+    from threadpoolctl import threadpool_info
 
     from univoxel.ops import native_status
 
+    runtimes = {p["filepath"] for p in threadpool_info() if p["user_api"] == "openmp"}
     status = native_status()
     return [
         Finding("univoxel", f"{__version__}, {Path(__file__).parent.parent}"),
@@ -77,7 +79,7 @@ def look() -> list[Finding]:
         kernels(status),
         embree(status),
         Finding("torch", torch_build()),
-        openmp(openmp_runtimes()),
+        openmp(sorted(runtimes)),
         threads(torch.get_num_threads(), machine.cores()),
         memory(machine.memory()),
         *extra_findings(),
@@ -173,14 +175,6 @@ def check(findings: Sequence[Finding]) -> None:
     bad = [f"{f.what}: {f.found}" for f in findings if f.state == "bad"]
     if bad:
         raise MissingNative(f"this installation cannot train: {'; '.join(bad)}")
-
-
-def openmp_runtimes() -> list[str]:
-    """Files of the OpenMP runtimes that this process has loaded."""
-    from threadpoolctl import threadpool_info
-
-    found = {p["filepath"] for p in threadpool_info() if p["user_api"] == "openmp"}
-    return sorted(found)
 
 
 def torch_build() -> str:

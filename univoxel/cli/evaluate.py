@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from univoxel.cli import parsing
 from univoxel.core import log
@@ -14,9 +14,6 @@ from univoxel.errors import UserError
 
 if TYPE_CHECKING:
     from rich.table import Table
-
-    from univoxel.data import Photos
-    from univoxel.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -103,6 +100,7 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
     from statistics import fmean
 
     from univoxel.detail.texture import albedo_near
+    from univoxel.detail.views import measure_full_size
     from univoxel.evaluation import views
     from univoxel.evaluation.measures import (
         albedo_scales,
@@ -112,8 +110,8 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
         rank_correlation,
     )
     from univoxel.render.pipeline import extract_mesh
-    from univoxel.run import photos_of
-    from univoxel.scene import load_checkpoint
+    from univoxel.run import load_verdict, photos_of
+    from univoxel.scene import FILE, load_checkpoint
 
     run = Path(asked.run)
     paths = asked.data, asked.save, asked.json
@@ -142,13 +140,24 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
         "trust_spearman": rank_correlation(found.errors["albedo"]),
         "trust_spearman_roughness": rank_correlation(found.errors["roughness"]),
         "trust_spearman_normal": rank_correlation(found.errors["normal"]),
-        **_costs(run, scene, report),
+        "train_seconds": report.get("seconds"),
+        "threads": report.get("threads"),
+        "peak_rss_mb": report.get("peak_rss_mb"),
+        "parameters": sum(p.numel() for p in scene.parameters()),
+        "model_bytes": (run / FILE).stat().st_size,
     }
     if asked.full_size:
-        result |= _at_full_size(scene, run, data, photos, save)
+        try:
+            train = photos_of(run, data, "train")
+        except (UserError, OSError) as error:  # views are the model's only
+            log.info("full size: without photographs, novel views use only the model: %s", error)
+            train = None
+        result |= measure_full_size(scene, run, photos, train, save)
     figures = views.say_trust(surveyed, report.get("troubles", []), save)
     if json:
-        write_json(json, result | _verdict(run) | figures)
+        verdict = load_verdict(run)
+        came = {"complete": verdict and verdict.complete, "verdict": verdict and verdict.word}
+        write_json(json, result | came | figures)
     return result
 
 
@@ -169,39 +178,3 @@ def table(result: dict[str, float | int | None]) -> Table:
         if (value := result[key]) is not None:
             rows.add_row(key, meaning, f"{value:.4g}" if isinstance(value, float) else f"{value}")
     return rows
-
-
-def _at_full_size(
-    scene: Scene, run: Path, data: Path | None, photos: Photos, save: Path | None
-) -> dict[str, float | int | None]:
-    """Measures at the size of the photographs' files."""
-    from univoxel.detail.views import measure_full_size
-    from univoxel.run import photos_of
-
-    try:
-        train = photos_of(run, data, "train")
-    except (UserError, OSError) as error:  # views are the model's only
-        log.info("full size: without photographs, novel views use only the model: %s", error)
-        train = None
-    return dict(measure_full_size(scene, run, photos, train, save))
-
-
-def _costs(run: Path, scene: Scene, report: dict) -> dict[str, float | int | None]:
-    """What training took, and the size of the model."""
-    from univoxel.scene import FILE
-
-    return {
-        "train_seconds": report.get("seconds"),
-        "threads": report.get("threads"),
-        "peak_rss_mb": report.get("peak_rss_mb"),
-        "parameters": sum(p.numel() for p in scene.parameters()),
-        "model_bytes": (run / FILE).stat().st_size,
-    }
-
-
-def _verdict(run: Path) -> dict[str, Any]:
-    """How training came out, for JSON."""
-    from univoxel.run import load_verdict
-
-    verdict = load_verdict(run)
-    return {"complete": verdict and verdict.complete, "verdict": verdict and verdict.word}

@@ -5,17 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from univoxel.cli.parsing import ADVANCED, File, Run, takes, written
 from univoxel.core import choices
 from univoxel.errors import UserError
-
-if TYPE_CHECKING:
-    from univoxel.core.records import Mesh
-    from univoxel.detail.texture import Detail
-    from univoxel.output.mesh import Placement
-    from univoxel.scene import Scene
 
 SUFFIXES = (".glb", ".obj", ".ply", ".usdz")
 TEXTURED_FACES = 20_000  # of textured meshes: the texture holds what they are too coarse for
@@ -98,11 +92,6 @@ def require_levels(faces: int, lods: int) -> None:
         )
 
 
-def level_path(mesh: Path, level: int) -> Path:
-    """The file of a level of detail: NAME.glb is the finest, NAME_lod1.glb the next."""
-    return mesh.with_name(f"{mesh.stem}_lod{level}{mesh.suffix}") if level else mesh
-
-
 @takes(ExportOptions)
 def export(asked: ExportOptions) -> list[Path]:
     """Export the surface as a mesh with materials.
@@ -117,8 +106,8 @@ def export(asked: ExportOptions) -> list[Path]:
         OSError: a file cannot be written.
     """
     from univoxel.detail.texture import load_detail
-    from univoxel.output.mesh import placement_of
-    from univoxel.output.mesh_files import require_usd
+    from univoxel.output.mesh import bake, placed, placement_of, with_materials
+    from univoxel.output.mesh_files import require_usd, write_glb, write_obj, write_ply, write_usdz
     from univoxel.output.surface import cameras_of, surface_of
     from univoxel.output.topology import close, simplify
     from univoxel.run import load_world
@@ -155,37 +144,18 @@ def export(asked: ExportOptions) -> list[Path]:
         if placement is None:  # all levels where the finest lies
             moved = load_world(run) if asked.origin == "world" else None
             placement = placement_of(reduced.vertices, asked.size, asked.origin, moved)
-        written.append(level_path(mesh, level))
-        size = max(widest >> level, TEXTURE_SIZES[0])
-        _write(written[-1], scene, reduced, placement, size, asked.jpeg, detail)
+        path = mesh.with_name(f"{mesh.stem}_lod{level}{mesh.suffix}") if level else mesh
+        if suffix == ".ply":
+            write_ply(path, placed(with_materials(scene, reduced), placement))
+        else:
+            size = max(widest >> level, TEXTURE_SIZES[0])
+            near = None if detail is None else detail.near
+            textured = placed(bake(scene, reduced, size, near), placement)
+            {".glb": write_glb, ".usdz": write_usdz, ".obj": write_obj}[suffix](
+                path, textured, asked.jpeg
+            )
+        written.append(path)
     return written
-
-
-def _write(
-    path: Path,
-    scene: Scene,
-    surface: Mesh,
-    placement: Placement,
-    size: int,
-    jpeg: int | None,
-    detail: Detail | None,
-) -> None:
-    """Write a surface, given in the scene's world, as its file's name says."""
-    from univoxel.output.mesh import bake, placed, with_materials
-    from univoxel.output.mesh_files import write_glb, write_obj, write_ply, write_usdz
-
-    if path.suffix.lower() == ".ply":
-        write_ply(path, placed(with_materials(scene, surface), placement))
-        return
-    albedo_near = None if detail is None else detail.near
-    mesh = placed(bake(scene, surface, size, albedo_near), placement)
-    match path.suffix.lower():
-        case ".glb":
-            write_glb(path, mesh, jpeg)
-        case ".usdz":
-            write_usdz(path, mesh, jpeg)
-        case ".obj":
-            write_obj(path, mesh, jpeg)
 
 
 command = export

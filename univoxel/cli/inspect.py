@@ -54,7 +54,8 @@ def inspect(asked: InspectOptions) -> Path:
     # left the photograph, with the point marked. The EXR beside it holds everything as it is:
     # <layer>.R .G .B, <layer>.open.
     from univoxel.data.images import write_exr, write_png
-    from univoxel.render.light_at_point import arriving, ray_of, sheet, true_light, view_of
+    from univoxel.lights.views import view_number
+    from univoxel.render.light_at_point import arriving, ray_of, sheet, true_light
     from univoxel.render.pipeline import surface_at
     from univoxel.run import photos_of
     from univoxel.scene import load_scene
@@ -69,7 +70,7 @@ def inspect(asked: InspectOptions) -> Path:
     scene = load_scene(run)
     scene.show_light_of(asked.light_of)
     photos = photos_of(run)
-    index = view_of(photos, asked.view)
+    index = view_number(photos.names, asked.view, "view")
     rays = ray_of(photos, index, pixel)
     surface = surface_at(scene, rays)
     if not surface.opacity[0] > MIN_OPACITY:

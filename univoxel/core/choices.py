@@ -14,12 +14,10 @@ CamerasFrom: TypeAlias = Literal["auto", "given", "refined"]
 MasksFrom: TypeAlias = Literal["auto", "given"]
 Varying: TypeAlias = Literal["none", "exposure", "light"]
 Differing: TypeAlias = Literal["auto", "none", "exposure", "light"]
-LightFrame: TypeAlias = Literal["world", "turntable", "camera"]
 Metal: TypeAlias = Literal["auto", "all", "some"]
 LightFrameOrAuto: TypeAlias = Literal["auto", "world", "turntable", "camera"]
 Detailing: TypeAlias = Literal["none", "texture"]  # from photographs at their own size
 DetailingOrAuto: TypeAlias = Literal["auto", "none", "texture"]
-FIELDS: tuple[FieldName, ...] = get_args(FieldName)
 LIGHTS: tuple[LightName, ...] = get_args(LightName)
 
 Background: TypeAlias = Literal["transparent", "map", "black"]

@@ -26,18 +26,18 @@ __all__ = [
     "splits_of",
 ]
 
-# Whether a folder has a layout, for a split; and the photographs of that split, or a DataError. In
-# this order: data sets with splits of their own come first
+# What says that a folder has a layout, for a split; and the photographs of that split, or a
+# DataError. In this order: data sets with splits of their own come first
 _LAYOUTS = (
     (transforms.is_blender, transforms.list_blender),
     (transforms.is_nerfstudio, transforms.list_nerfstudio),
-    (colmap.is_colmap, colmap.list_colmap),
+    (colmap.models_in, colmap.list_colmap),
     (research.is_llff, research.list_llff),
-    (research.is_idr, research.list_idr),
+    (research.idr_file, research.list_idr),
     (research.is_neilf, research.list_neilf),
-    (photogrammetry.is_polycam, photogrammetry.list_polycam),
-    (photogrammetry.is_metashape, photogrammetry.list_metashape),
-    (photogrammetry.is_realitycapture, photogrammetry.list_realitycapture),
+    (photogrammetry.polycam_place, photogrammetry.list_polycam),
+    (photogrammetry.metashape_file, photogrammetry.list_metashape),
+    (photogrammetry.realitycapture_file, photogrammetry.list_realitycapture),
     (research.is_tensoir, research.list_tensoir),
 )
 

@@ -46,28 +46,22 @@ class Registered:
     pose: np.ndarray  # [3, 4] camera-to-world, axes as in `Cameras`
 
 
-def is_colmap(folder: Path, split: str) -> bool:
-    return bool(_models(folder))
-
-
 def list_colmap(folder: Path, split: str) -> Listed:
-    models = _models(folder)
+    models = models_in(folder, split)
     if not models:
         raise DataError(f"{folder}: expected a COLMAP model in {', '.join(PLACES)}, got none")
     model, ending = models[0]
     cameras_file, images_file = model / f"cameras{ending}", model / f"images{ending}"
     for file in (cameras_file, images_file):
         inside(file, str(file))
+    file = cameras_file
     try:
-        cameras = read_cameras(cameras_file)
+        cameras, file = read_cameras(cameras_file), images_file
+        images = read_images(images_file)
     except DataError:
         raise
     except BROKEN as error:
-        raise _broken(cameras_file, error) from None
-    try:
-        images = read_images(images_file)
-    except BROKEN as error:
-        raise _broken(images_file, error) from None
+        raise DataError(f"{file}: this file of a COLMAP model could not be read: {error}") from None
     if not images:
         raise DataError(f"{images_file}: expected photographs with poses, got none")
     names: set[str] = set()
@@ -141,7 +135,11 @@ def read_images(path: Path) -> list[Registered]:
     Raises:
         ValueError, IndexError, struct.error: a broken file.
     """
-    rows = _images_text(path) if path.suffix == ".txt" else _images_binary(path)
+    if path.suffix == ".txt":
+        rows = _images_text(path)
+    else:
+        found = image_records(path.read_bytes())
+        rows = ((pose[:4], pose[4:], camera, name) for _, pose, camera, name, _ in found)
     images = []
     for quaternion, translation, camera, name in rows:
         largest = max(map(abs, quaternion))
@@ -157,7 +155,7 @@ def read_images(path: Path) -> list[Registered]:
     return images
 
 
-def _models(folder: Path) -> list[tuple[Path, str]]:
+def models_in(folder: Path, split: str) -> list[tuple[Path, str]]:
     """The models of the first place that has any: their folders and the ending of their files,
     binary ones first, as COLMAP does. That of the most photographs comes first: COLMAP numbers
     models as it begins them, and a first try may have ended with two photographs."""
@@ -187,10 +185,6 @@ def _count(images: Path) -> int:
         if images.suffix == ".bin":
             return int.from_bytes(file.read(8), "little")
         return sum(not line.startswith(b"#") for line in file) // 2
-
-
-def _broken(path: Path, error: Exception) -> DataError:
-    return DataError(f"{path}: this file of a COLMAP model could not be read: {error}")
 
 
 def _parameters(path: Path, number: int, model: str) -> int:
@@ -239,11 +233,6 @@ def _images_text(path: Path) -> Iterator[tuple[list[float], list[float], int, st
             raise ValueError(f"expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, got {line!r}")
         yield values[:4], values[4:], int(camera), name.strip()
         next(lines, None)  # its points, a line that may be empty
-
-
-def _images_binary(path: Path) -> Iterator[tuple[list[float], list[float], int, str]]:
-    for _, pose, camera, name, _ in image_records(path.read_bytes()):
-        yield pose[:4], pose[4:], camera, name
 
 
 def image_records(data: bytes) -> Iterator[tuple[int, list[float], int, str, np.ndarray]]:

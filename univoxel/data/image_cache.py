@@ -16,7 +16,7 @@ import zlib
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, suppress
 from contextvars import ContextVar
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from torch import Tensor
 
 from univoxel.core import log, memmap, system
 from univoxel.core.files import replacing
-from univoxel.data.photos import Photos, coverage_of
+from univoxel.data.photos import Photos
 
 # What is raised of files that are none of ours, or broken
 UNFIT = (OSError, SafetensorError, ValueError, KeyError, TypeError, AttributeError)
@@ -127,12 +127,6 @@ class Reading:
         if self.partial is not None and self.read % FLUSHED == 0:
             system.flush(self.partial)
             _set_facts(self.partial, self._facts())
-
-    def with_floating_alpha(self) -> Reading:
-        """The same in memory, as `keep_photos` may keep it at the end: that some masks are stored
-        in other ways than the first is rare."""
-        self.drop()
-        return replace(self, alpha=coverage_of(self.alpha), partial=None)
 
     def drop(self) -> None:
         """Leave no file."""

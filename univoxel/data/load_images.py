@@ -239,7 +239,11 @@ def _read_all(
                     f"format as {shots[0].name}"
                 )
             if alpha.dtype != reading.alpha.dtype:
-                alpha, reading = coverage_of(alpha), reading.with_floating_alpha()
+                # In memory, as `keep_photos` may keep it at the end: masks stored in ways that
+                # differ are rare
+                reading.drop()
+                whole = coverage_of(reading.alpha)
+                alpha, reading = coverage_of(alpha), replace(reading, alpha=whole, partial=None)
             reading.empty &= not alpha.any()
             most = OPAQUE * (1 if alpha.is_floating_point() else 255)
             reading.opaque &= bool((alpha >= most).all())

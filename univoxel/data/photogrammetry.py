@@ -63,13 +63,9 @@ OFF = ("0", "false", "False")  # as the attribute enabled of a camera
 TERMS = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2", "cx", "cy")
 
 
-def is_metashape(folder: Path, split: str) -> bool:
-    return _xml_file(folder) is not None
-
-
 def list_metashape(folder: Path, split: str) -> Listed:
     """Of several components the one with most cameras is read."""
-    path = _xml_file(folder) or folder / "cameras.xml"
+    path = metashape_file(folder, split) or folder / "cameras.xml"
     chunk = _chunk(path)
     sensors = {s.get("id"): s for s in chunk.iterfind("sensors/sensor")}
     every = list(chunk.iterfind("cameras//camera"))
@@ -111,7 +107,7 @@ def list_metashape(folder: Path, split: str) -> Listed:
     return turned_up(folder, split, "Metashape cameras", shots, lost)
 
 
-def _xml_file(folder: Path) -> Path | None:
+def metashape_file(folder: Path, split: str) -> Path | None:
     return _first(folder, "*.xml", lambda head: b"<document" in head and b"<chunk" in head)
 
 
@@ -213,12 +209,8 @@ REQUIRED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 OTHER_NAMES = {"yaw": "heading", "f_35mm": "f", "px_norm": "px", "py_norm": "py"}
 
 
-def is_realitycapture(folder: Path, split: str) -> bool:
-    return _csv_file(folder) is not None
-
-
 def list_realitycapture(folder: Path, split: str) -> Listed:
-    path = _csv_file(folder) or folder / "cameras.csv"
+    path = realitycapture_file(folder, split) or folder / "cameras.csv"
     rows = _rows(path)
     shots, missing = [], []
     for line, row in rows:
@@ -235,7 +227,7 @@ def list_realitycapture(folder: Path, split: str) -> Listed:
     return turned_up(folder, split, "RealityCapture cameras", shots, lost)
 
 
-def _csv_file(folder: Path) -> Path | None:
+def realitycapture_file(folder: Path, split: str) -> Path | None:
     def fits(head: bytes) -> bool:
         return any(map(_delimiter, _text(head, "replace").splitlines()[:2]))
 
@@ -319,13 +311,9 @@ PLACES = ("keyframes/corrected_", "keyframes/", "corrected_")
 UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0]])  # from +Y up to +Z up
 
 
-def is_polycam(folder: Path, split: str) -> bool:
-    return _place(folder) is not None
-
-
 def list_polycam(folder: Path, split: str) -> Listed:
     """The world keeps its scale, metres, and its origin, and is turned from +Y up to +Z up."""
-    place = _place(folder) or PLACES[0]
+    place = polycam_place(folder, split) or PLACES[0]
     cameras = sorted((folder / f"{place}cameras").glob("*.json"))
     pictures = folder / f"{place}images"
     shots, missing = [], []
@@ -348,7 +336,7 @@ def list_polycam(folder: Path, split: str) -> Listed:
     return Listed("Polycam raw data", shots, [*lost, "world rotated so that +Z is up (was +Y)"])
 
 
-def _place(folder: Path) -> str | None:
+def polycam_place(folder: Path, split: str) -> str | None:
     return next((p for p in PLACES if any((folder / f"{p}cameras").glob("*.json"))), None)
 
 

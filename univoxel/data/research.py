@@ -127,13 +127,9 @@ IMAGES = ("image", "images", "rgb")
 IDR_MASKS = ("mask", "masks")
 
 
-def is_idr(folder: Path, split: str) -> bool:
-    return _idr_file(folder) is not None
-
-
 def list_idr(folder: Path, split: str) -> Listed:
     """The world is that of world_mat."""
-    path = _idr_file(folder) or folder / FILES[0]
+    path = idr_file(folder, split) or folder / FILES[0]
     matrices, pictures = _matrices(path), _idr_pictures(folder, path)
     numbers = _numbers(path, sorted(matrices), pictures)
     missing = [f"number {number}" for number in sorted(matrices) if number not in numbers]
@@ -171,7 +167,7 @@ def decomposed(matrix: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
     return upper / upper[2, 2], pose
 
 
-def _idr_file(folder: Path) -> Path | None:
+def idr_file(folder: Path, split: str) -> Path | None:
     return next((path for name in FILES if (path := folder / name).is_file()), None)
 
 

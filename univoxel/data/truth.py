@@ -166,7 +166,7 @@ def relight_maps(folder: str | Path) -> dict[str, Path]:
     folder = Path(folder)
     maps = {}
     for pictures in sorted((folder / "relight").glob("*/")):
-        found = _map(folder / "envmaps", pictures.name)
+        found = map_file(folder / "envmaps", pictures.name)
         if found is None:
             raise DataError(
                 f"{pictures}: expected the environment map of these images, "
@@ -182,7 +182,7 @@ def relight_maps(folder: str | Path) -> dict[str, Path]:
         names |= lights
     places = [p / sub for p in (folder, folder.resolve().parent) for sub in ("envmaps", ".")]
     for name in sorted(names):
-        found = next((path for place in places if (path := _map(place, name))), None)
+        found = next((path for place in places if (path := map_file(place, name))), None)
         if found is not None:
             maps[name] = found
     return maps
@@ -220,7 +220,7 @@ def load_points(folder: str | Path) -> Tensor | None:
     return torch.from_numpy(points)
 
 
-def _map(folder: Path, name: str) -> Path | None:
+def map_file(folder: Path, name: str) -> Path | None:
     return next((p for end in MAP_ENDINGS if (p := folder / (name + end)).is_file()), None)
 
 

@@ -177,7 +177,7 @@ def survey(scene: Scene, photos: Photos, points: int) -> Survey:
     mean_length = (total(observations.wo).norm(dim=1) / at_least_one).clamp(0, 1)
     spread = torch.where(counts > 0, mean_length.acos().rad2deg(), 0.0)
     compared = spread_observations(observations, OBSERVATIONS)
-    disagreement, gloss = compare(scene, observations, transport, compared, ROUGHNESS_STEP)
+    disagreement, gloss = compare(scene, observations, transport, compared)
     key = key_of(position, normal, offset)
     count = min(points, max(1, AROUND * points // AROUND_POINTS))
     nearest = KDTree(key).query(key, k=count, workers=-1)[1].reshape(points, count)
@@ -232,7 +232,6 @@ def compare(
     observations: Observations,
     transport: Transport,
     which: tuple[Tensor, Tensor],
-    roughness_step: float,
 ) -> tuple[Tensor, Tensor]:
     """Mean absolute sRGB difference between photographs and render, and root mean square of the
     render's slope by roughness: [P] each; 0 for points without observations.
@@ -241,12 +240,11 @@ def compare(
 
     Args:
         which: indices of the points and observations that are compared.
-        roughness_step: change in roughness over which the slope is measured.
     """
     point, observation = which
     features = scene.field.features_at(observations.position)
     albedo, roughness, metallic = scene.material(features)
-    step = torch.where(roughness > 0.5, -roughness_step, roughness_step)
+    step = torch.where(roughness > 0.5, -ROUGHNESS_STEP, ROUGHNESS_STEP)
     surface = Surface(
         position=observations.position,
         normal=observations.normal,
@@ -517,7 +515,10 @@ def advise(
     weighed = weighed[elevations(weighed) >= min(lowest, 89.0)]
     shown = torch.stack([_shown(surveyed, surface, middle + distance * w) for w in weighed])
 
-    straight, agreeing = surveyed.straight.clone(), _agreeing(surveyed)
+    straight = surveyed.straight.clone()
+    # Beside the best of the surface: what disagrees everywhere, as after a short training, is
+    # repaired by no photograph
+    agreeing = (surveyed.agreeing / surveyed.agreeing.quantile(BEST)).clamp_max(1)
     nearest = _degrees(weighed, taken).amin(1)
     gap, first = nearest > GAP, None
     chosen, gains = [], []
@@ -564,12 +565,6 @@ def _shown(surveyed: Survey, surface: VisibilityScene, eye: Tensor) -> Tensor:
     visible = ~surface.occluded(start, towards[facing], 0.0, reach)
     found[facing] = cosine[facing].square() * visible
     return found
-
-
-def _agreeing(surveyed: Survey) -> Tensor:
-    """`Survey.agreeing` [P] beside the best of the surface, in [0, 1]: what disagrees everywhere,
-    as after a short training, is repaired by no photograph."""
-    return (surveyed.agreeing / surveyed.agreeing.quantile(BEST)).clamp_max(1)
 
 
 def _degrees(a: Tensor, b: Tensor) -> Tensor:

@@ -204,9 +204,10 @@ def load_scene_truth(photos: Photos) -> SceneTruth:
     Raises:
         DataError: a file cannot be used, or has other pixels than the views.
     """
-    relit = _relit_photos(photos)
+    paths = relight_maps(photos.folder)
+    relit = {name: load_relit(photos, name) for name in paths}
     points = load_points(photos.folder)
-    maps = {name: read_map(path) for name, path in relight_maps(photos.folder).items()}
+    maps = {name: read_map(path) for name, path in paths.items()}
     return SceneTruth(relit, maps, points)
 
 
@@ -263,23 +264,13 @@ def every_nth(photos: Photos, trained: list[str], every: int) -> Photos:
 def view_truth(photos: Photos, view: int) -> Truth:
     """The layers of truth of one test view, as far as there are any."""
     truth = load_truth(photos, view)
-    if truth.mask is not None:
-        _check_size(photos, view, truth.mask, f"truth of {photos.names[view]}")
-    return truth
-
-
-def _relit_photos(photos: Photos) -> dict[str, tuple[Tensor, Tensor]]:
-    """Stored colour and alpha of the test views, by map."""
-    return {name: load_relit(photos, name) for name in relight_maps(photos.folder)}
-
-
-def _check_size(photos: Photos, view: int, picture: Tensor, what: str) -> None:
     width, height = photos.cameras.size(view)
-    if picture.shape != (height, width):
+    if truth.mask is not None and truth.mask.shape != (height, width):
         raise DataError(
-            f"{photos.folder}: expected {what} with {width}x{height} pixels as in the test view, "
-            f"got {picture.shape[1]}x{picture.shape[0]}"
+            f"{photos.folder}: expected truth of {photos.names[view]} with {width}x{height} pixels "
+            f"as in the test view, got {truth.mask.shape[1]}x{truth.mask.shape[0]}"
         )
+    return truth
 
 
 # The metrics of a trained scene, and their definitions.

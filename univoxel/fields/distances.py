@@ -90,7 +90,9 @@ class AbstractDistances(nn.Module, ABC):
         Args:
             values: as the sdf, and C; without them C is 0.
         """
-        return self._sample(self.sdf, no_values(self.sdf) if values is None else values, points)
+        if values is None:
+            values = self.sdf.detach().new_empty(*self.sdf.shape, 0)
+        return self._sample(self.sdf, values, points)
 
     def interpolate(self, values: Tensor, points: Tensor) -> Tensor:
         """Values of nodes alone at world points [M, 3]: [M, C]; no gradient to the sdf, not even
@@ -206,16 +208,6 @@ def nodes_within(distances: AbstractDistances, far: float) -> Tensor:
     return distances.on_grid(distances.sdf.detach().abs() < far)
 
 
-def cut_by_border(sdf: np.ndarray) -> bool:
-    """Whether the inside reaches the border of a grid's values [X, Y, Z]."""
-    return any((sdf.take(end, axis) < 0).any() for axis in range(3) for end in (0, -1))
-
-
-def no_values(sdf: Tensor) -> Tensor:
-    """Values of nodes with no channels."""
-    return sdf.detach().new_empty(*sdf.shape, 0)
-
-
 # A dense grid of signed distances: one at every node.
 
 
@@ -241,7 +233,8 @@ class DenseDistances(AbstractDistances):
         sdf = self.sdf.detach().numpy()
         if not sdf.min() < 0 < sdf.max():
             raise NoSurface("the field has no surface: its sdf does not change sign")
-        rim = int(closed and cut_by_border(sdf))
+        ends = (sdf.take(end, axis) for axis in range(3) for end in (0, -1))
+        rim = int(closed and any((end < 0).any() for end in ends))
         padded = np.pad(sdf, rim, constant_values=CAP * self.voxel_size)
         vertices, faces, _, _ = marching_cubes(padded, 0.0, gradient_direction="descent")
         origin = torch.tensor(self.grid.origin)

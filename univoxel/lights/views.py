@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -17,6 +18,19 @@ from univoxel.sphere import real_harmonics
 
 DEGREE = 3  # of the harmonics that a view's map may differ by at first: halves, quarters of the sky
 RATE = 10.0  # the learning rate of networks moves log gains that much faster: a stop is soon taken
+
+
+def view_number(names: Sequence[str], view: str, argument: str) -> int:
+    """The number of a view that an argument gives by name or number; a UserError if none is."""
+    if view in names:
+        return names.index(view)
+    if view.isdigit() and int(view) < len(names):
+        return int(view)
+    raise UserError(
+        f"{argument}: expected a number below {len(names)} or a name from {names[0]} to "
+        f"{names[-1]}, got {view!r}",
+        argument,
+    )
 
 
 @dataclass(frozen=True)
@@ -81,16 +95,7 @@ class ViewLights(nn.Module):
         Raises:
             UserError: no such view.
         """
-        if view is None or view in self.names:
-            self.chosen = None if view is None else self.names.index(view)
-        elif view.isdigit() and int(view) < len(self):
-            self.chosen = int(view)
-        else:
-            raise UserError(
-                f"light_of: expected a number below {len(self)} or a name from {self.names[0]} to "
-                f"{self.names[-1]}, got {view!r}",
-                "light_of",
-            )
+        self.chosen = None if view is None else view_number(self.names, view, "light_of")
 
     def add(self, to_gains: Tensor, to_weights: Tensor | None = None) -> Tensor:
         """Add to log gains [V, 3] and weights [V, R, 3], but for what all views have of it.

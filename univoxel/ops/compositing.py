@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ from univoxel.ops.grid import (
     sample_dense_reference,
     sample_sparse_reference,
 )
-from univoxel.ops.hash_grid import check_levels, encode_hash_reference, lattice_sizes
+from univoxel.ops.hash_grid import check_levels, encode_hash_reference
 
 
 def section_alpha(sdf: Tensor, connected: Tensor, inv_s: float) -> Tensor:
@@ -188,73 +188,12 @@ def composite_field(
     treated as constant. Second order raises.
     Source: Wang et al. 2021 (NeuS), eq. 13; Max 1995 for the sums.
     """
-    _check(sdf, features, origin, direction, samples, bricks, levels)
-    check_place("composite_field", len(samples.t), grid_origin, voxel_size)
-    if not 0 < inv_s < math.inf:
-        raise ValueError(f"composite_field: inv_s must be positive and finite, got {inv_s}")
-    if not 0 <= min_share < 1:
-        raise ValueError(f"composite_field: min_share must be in [0, 1), got {min_share}")
-    options = {"bricks": bricks, "levels": levels, "min_share": min_share}
-    place = [float(x) for x in grid_origin], float(voxel_size), float(inv_s)
-    rays = origin, direction, samples
-    if native.serves(sdf):
-        total = _total(sdf, features, *rays, *place, **options, sparse_grad=sparse_grad)
-    else:
-        if sparse_grad:
-            sdf = SparseGrad.apply(sdf, sdf.dim())
-            features = SparseGrad.apply(features, features.dim() - 1)
-        total = composite_field_reference(sdf, features, *rays, *place, **options)
-    opacity, t, gradient, composited = total.split([1, 1, 3, total.shape[1] - RAY_NUMBERS], 1)
-    return FieldAlongRays(opacity[:, 0], t[:, 0], gradient, composited)
-
-
-def _total(
-    sdf: Tensor,
-    features: Tensor,
-    origin: Tensor,
-    direction: Tensor,
-    samples: Samples,
-    grid_origin: list[float],
-    voxel_size: float,
-    inv_s: float,
-    bricks: Bricks | None,
-    levels: Lattices | None,
-    min_share: float,
-    sparse_grad: bool,
-) -> Tensor:
-    """As the reference, from the kernel."""
-    table = grid_sampling.no_table(sdf) if bricks is None else bricks.table
-    corners = [[float(x) for x in part] for part in levels or ((), (), ())]
-    total, _ = _composite_field(
-        *(x.contiguous() for x in (sdf, features, table, origin, direction)),
-        *(x.contiguous() for x in (samples.t, samples.connected, samples.offsets)),
-        list(sdf.shape if bricks is None else bricks.size),
-        grid_origin,
-        voxel_size,
-        *corners,
-        inv_s,
-        float(min_share),
-        sparse_grad,
-    )
-    return total
-
-
-def _check(
-    sdf: Tensor,
-    features: Tensor,
-    origin: Tensor,
-    direction: Tensor,
-    samples: Samples,
-    bricks: Bricks | None,
-    levels: Lattices | None,
-) -> None:
-    op = "composite_field"
     nodes = "X Y Z"
     if bricks is not None:
-        check_bricks(op, bricks, sdf=(sdf, "R"))
+        check_bricks("composite_field", bricks, sdf=(sdf, "R"))
         nodes = "R"
     sizes = check(
-        op,
+        "composite_field",
         sdf=(sdf, nodes),
         features=(features, "T F" if levels is not None else f"{nodes} C"),
         origin=(origin, "N 3"),
@@ -264,9 +203,36 @@ def _check(
         offsets=(samples.offsets, "N+1", torch.int64),
     )
     if not sdf.numel():
-        raise ValueError(f"{op}: sdf must not be empty, got {list(sdf.shape)}")
+        raise ValueError(f"composite_field: sdf must not be empty, got {list(sdf.shape)}")
     if levels is not None:
-        check_levels(op, sizes["T"], *levels)
+        check_levels("composite_field", sizes["T"], *levels)
+    check_place("composite_field", len(samples.t), grid_origin, voxel_size)
+    if not 0 < inv_s < math.inf:
+        raise ValueError(f"composite_field: inv_s must be positive and finite, got {inv_s}")
+    if not 0 <= min_share < 1:
+        raise ValueError(f"composite_field: min_share must be in [0, 1), got {min_share}")
+    start = [float(x) for x in grid_origin]
+    if native.serves(sdf):
+        table = grid_sampling.no_table(sdf) if bricks is None else bricks.table
+        corners = [[float(x) for x in part] for part in levels or ((), (), ())]
+        total, _ = _composite_field(
+            *(x.contiguous() for x in (sdf, features, table, origin, direction)),
+            *(x.contiguous() for x in (samples.t, samples.connected, samples.offsets)),
+            list(sdf.shape if bricks is None else bricks.size),
+            *(start, float(voxel_size)),
+            *corners,
+            *(float(inv_s), float(min_share), sparse_grad),
+        )
+    else:
+        if sparse_grad:
+            sdf = SparseGrad.apply(sdf, sdf.dim())
+            features = SparseGrad.apply(features, features.dim() - 1)
+        place = start, float(voxel_size), float(inv_s)
+        options = {"bricks": bricks, "levels": levels, "min_share": min_share}
+        rays = origin, direction, samples
+        total = composite_field_reference(sdf, features, *rays, *place, **options)
+    opacity, t, gradient, composited = total.split([1, 1, 3, total.shape[1] - RAY_NUMBERS], 1)
+    return FieldAlongRays(opacity[:, 0], t[:, 0], gradient, composited)
 
 
 def composite_field_reference(
@@ -313,22 +279,13 @@ def composite_field_reference(
     return torch.cat([opacity, summed((share * samples.t)[:, None]), scale * sums], 1)
 
 
-def _hash_place(
-    lower: list[float], upper: list[float], voxel_sizes: list[float]
-) -> hash_grid.Place:
-    """Levels as the extension takes them; none: no hash table."""
-    if not voxel_sizes:
-        return [], [0.0] * 3, []
-    return lattice_sizes(lower, upper, voxel_sizes), lower, voxel_sizes
-
-
 def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) -> None:
     sdf, features, table, *rays = tensors
     *place, lower, upper, voxel_sizes, inv_s, min_share, _ = options
     native.require().composite_field_forward(
         grid_sampling.grid_of(table, *place),
         *native.arrays(sdf, features),
-        *_hash_place(lower, upper, voxel_sizes),
+        *hash_grid.place_of(lower, upper, voxel_sizes),
         *native.arrays(*rays),
         inv_s,
         min_share,
@@ -337,63 +294,37 @@ def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) ->
     )
 
 
-class _Adjoints(NamedTuple):
-    """Derivatives of the loss to what was read of each sample, and where that was."""
-
-    points: Tensor  # [M, 3]
-    feature_points: Tensor  # [M, 3] the same, or NaN where no features were read
-    value: Tensor  # [M]
-    gradient: Tensor  # [M, 3]
-    feature: Tensor  # [M, C]
-
-
-def _adjoints(
-    saved: Sequence[Tensor],
-    grad_out: Tensor,
-    grid: Any,
-    levels: hash_grid.Place,
-    density: Sequence[float],
-) -> _Adjoints:
-    """Through compositing and opacity, back to samples."""
-    sdf, features, _, *rays, held = saved
-    t = rays[2]
-    adjoints = _Adjoints(
-        t.new_empty(len(t), 3),
-        t.new_empty(len(t), 3),
-        torch.empty_like(t),
-        t.new_empty(len(t), 3),
-        t.new_empty(len(t), held.shape[1] - SAMPLE_NUMBERS),
-    )
-    native.require().composite_field_pulls(
+def _backward(
+    saved: Sequence[Tensor], grads: Sequence[Tensor], options: Sequence, needs: list[bool]
+) -> list[Tensor | None]:
+    """Back to samples, from there to nodes, or to the hash table, and to rays."""
+    sdf, features, table, *rays, held = saved
+    _, direction, t, _, offsets = rays
+    *place, lower, upper, voxel_sizes, inv_s, min_share, sparse = options
+    core, grid = native.require(), grid_sampling.grid_of(table, *place)
+    levels = hash_grid.place_of(lower, upper, voxel_sizes)
+    # Where samples lie, NaN where no features were read; and derivatives to what was read of them
+    points, feature_points, of_gradient = (t.new_empty(len(t), 3) for _ in range(3))
+    of_value, of_feature = torch.empty_like(t), t.new_empty(len(t), held.shape[1] - SAMPLE_NUMBERS)
+    core.composite_field_pulls(
         grid,
         *native.arrays(sdf, features),
         *levels,
         *native.arrays(*rays),
-        *density,
-        *native.arrays(held, grad_out, *adjoints),
+        *(inv_s, min_share),
+        *native.arrays(held, grads[0], points, feature_points),
+        *native.arrays(of_value, of_gradient, of_feature),
         native.threads(),
     )
-    return adjoints
-
-
-def _backward(
-    saved: Sequence[Tensor], grads: Sequence[Tensor], options: Sequence, needs: list[bool]
-) -> list[Tensor | None]:
-    """From samples to nodes, or to the hash table, and to rays."""
-    sdf, features, table, _, direction, t, _, offsets, _ = saved
-    *place, lower, upper, voxel_sizes, inv_s, min_share, sparse = options
-    grid = grid_sampling.grid_of(table, *place)
-    levels = _hash_place(lower, upper, voxel_sizes)
-    at = _adjoints(saved, grads[0], grid, levels, (inv_s, min_share))
     hashed, moved = bool(voxel_sizes), needs[2] or needs[3]
     of_nodes = sdf.new_empty(*sdf.shape, 0) if hashed else features
-    feature = at.feature[:, :0] if hashed else at.feature
+    node_feature = of_feature[:, :0] if hashed else of_feature
     order = torch.empty(len(t), dtype=torch.int32)
-    native.require().sort_by_tile(grid, *native.arrays(at.points, order), native.threads())
+    core.sort_by_tile(grid, *native.arrays(points, order), native.threads())
     of_sdf, of_features, of_points = grid_sampling.gradients(
         grid,
-        (sdf, of_nodes, at.points, order),
-        (at.value, at.gradient, feature.contiguous()),
+        (sdf, of_nodes, points, order),
+        (of_value, of_gradient, node_feature.contiguous()),
         [needs[0], needs[1] and not hashed, moved],
         sparse,
     )
@@ -401,7 +332,7 @@ def _backward(
     if hashed:
         hash_needs, count = [needs[1], moved], len(voxel_sizes)
         of_features, of_hash = hash_grid.gradients(
-            features, at.feature_points, at.feature, levels, count, hash_needs, sparse
+            features, feature_points, of_feature, levels, count, hash_needs, sparse
         )
     of_origin = of_direction = None
     if of_points is not None:

@@ -173,7 +173,7 @@ def rows_read(
     sizes = check("rows_read", table=(table, "N F"), points=(points, "M 3"))
     check_levels("rows_read", sizes["N"], lower, upper, voxel_sizes)
     if native.serves(table):
-        place = _place([*lower], [*upper], [*voxel_sizes])
+        place = place_of([*lower], [*upper], [*voxel_sizes])
         return _touched(table.contiguous(), points.contiguous(), place)[1]
     rows = len(table) // len(voxel_sizes)
     points = points[~points.isnan().any(1)]
@@ -186,9 +186,9 @@ def rows_read(
     return torch.cat(found).unique()
 
 
-def _place(lower: list[float], upper: list[float], voxel_sizes: list[float]) -> Place:
-    """Levels as the extension takes them."""
-    return lattice_sizes(lower, upper, voxel_sizes), lower, voxel_sizes
+def place_of(lower: list[float], upper: list[float], voxel_sizes: list[float]) -> Place:
+    """Levels as the extension takes them; none: no hash table."""
+    return lattice_sizes(lower, upper, voxel_sizes), lower or [0.0] * 3, voxel_sizes
 
 
 def _touched(table: Tensor, points: Tensor, place: Place) -> tuple[Any, Tensor]:
@@ -239,7 +239,7 @@ def gradients(
 
 def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) -> None:
     native.require().encode_hash_forward(
-        *native.arrays(*tensors, *outputs), *_place(*options[:3]), native.threads()
+        *native.arrays(*tensors, *outputs), *place_of(*options[:3]), native.threads()
     )
 
 
@@ -247,7 +247,7 @@ def _backward(
     saved: Sequence, grads: Sequence[Tensor], options: Sequence, needs: list[bool]
 ) -> tuple[Tensor | None, Tensor | None]:
     (table, points), (lower, upper, voxel_sizes, sparse, felt) = saved, options
-    place = _place(lower, upper, voxel_sizes)
+    place = place_of(lower, upper, voxel_sizes)
     return gradients(table, points, grads[0], place, felt, needs, sparse)
 
 

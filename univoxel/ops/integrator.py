@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -145,21 +145,6 @@ def relight(
     Carries no gradients. Source: Veach 1997, chapters 9 and 10; Heitz 2018 and Dupuy and Benyoub
     2023 (visible normals); Burley 2020 (Owen scrambling).
     """
-    points = (position, normal, wo, albedo, roughness)
-    _check_tensors(points, tables, f0)
-    _check_numbers(offset, samples, bounces, first, seed, strategy)
-    materials = _materials(scene, mesh, mesh_f0) if bounces else (None,) * 4
-    traced = scene.native()
-    if traced is None:
-        raise RuntimeError("relight: runs on the native backend only, got use_backend('reference')")
-    lights = (tables, _pack_suns(suns), _pack_point_lights(point_lights))
-    numbers = (offset, first, samples, bounces, seed)
-    points = (*points, _rows_of_f0(f0, position))
-    return _relight(traced, materials, lights, points, numbers, strategy)
-
-
-def _check_tensors(points: tuple[Tensor, ...], tables: EnvTables, f0: Tensor | float) -> None:
-    position, normal, wo, albedo, roughness = points
     check(
         "relight",
         position=(position, "N 3", torch.float32),
@@ -175,11 +160,6 @@ def _check_tensors(points: tuple[Tensor, ...], tables: EnvTables, f0: Tensor | f
         raise ValueError(f"relight: points must be on the cpu, got {position.device}")
     if isinstance(f0, Tensor):
         check("relight", position=(position, "N 3", torch.float32), f0=(f0, "N 3", torch.float32))
-
-
-def _check_numbers(
-    offset: float, samples: int, bounces: int, first: int, seed: int, strategy: Strategy
-) -> None:
     for name, value, ok in (
         ("offset must be finite and at least 0", offset, 0 <= offset < math.inf),
         ("samples must be at least 1", samples, samples >= 1),
@@ -191,29 +171,22 @@ def _check_numbers(
     ):
         if not ok:
             raise ValueError(f"relight: {name}, got {value!r}")
-
-
-def _relight(
-    traced: Any,
-    materials: tuple[Tensor | None, ...],
-    lights: tuple[EnvTables, Tensor, Tensor],
-    points: tuple[Tensor, ...],
-    numbers: tuple[float | int, ...],
-    strategy: Strategy,
-) -> Tensor:
-    """Radiance [N, 3] of the native integrator; arguments as it takes them."""
-    tables, *others = lights
-    rgb = torch.empty_like(points[0], memory_format=torch.contiguous_format)
+    materials = _materials(scene, mesh, mesh_f0) if bounces else (None,) * 4
+    traced = scene.native()
+    if traced is None:
+        raise RuntimeError("relight: runs on the native backend only, got use_backend('reference')")
+    points = (position, normal, wo, albedo, roughness, _rows_of_f0(f0, position))
+    rgb = torch.empty_like(position, memory_format=torch.contiguous_format)
     core = native.require()
     core.relight(
         traced,
         *map(_array, materials),
         *map(_array, (tables.texel, tables.row_cdf, tables.column_cdf)),
         tables.rotation,
-        *map(_array, others),
+        *map(_array, (_pack_suns(suns), _pack_point_lights(point_lights))),
         *map(_array, points),
         *native.arrays(rgb),
-        *numbers,
+        *(offset, first, samples, bounces, seed),
         getattr(core.Strategy, strategy),
         native.threads(),
     )

@@ -113,8 +113,22 @@ def march(
 
     Not differentiable. Source: Wang et al. 2021 (NeuS), eq. 13.
     """
-    _check_march(sdf, brick_min, origin, direction, jitter, bricks)
-    _check_ranges(voxel_size, step, inv_s, min_weight, early_stop)
+    if bricks is not None:
+        check_bricks("march", bricks, sdf=(sdf, "R"), brick_min=(brick_min, "n"))
+    check(
+        "march",
+        sdf=(sdf, "X Y Z" if bricks is None else "R"),
+        brick_min=(brick_min, "A B C" if bricks is None else "n"),
+        origin=(origin, "N 3"),
+        direction=(direction, "N 3"),
+        jitter=(jitter, "N"),
+    )
+    for name, number in (("voxel_size", voxel_size), ("step", step), ("inv_s", inv_s)):
+        if not 0 < number < float("inf"):
+            raise ValueError(f"march: {name} must be positive and finite, got {number}")
+    for name, number in (("min_weight", min_weight), ("early_stop", early_stop)):
+        if not 0 <= number <= 1:
+            raise ValueError(f"march: {name} must be in [0, 1], got {number}")
     if not native.serves(sdf):
         return march_reference(
             sdf if bricks is None else sdf[bricks.grid_rows()],
@@ -144,37 +158,6 @@ def march(
     return Samples(
         torch.from_numpy(t), torch.from_numpy(connected).bool(), torch.from_numpy(offsets)
     )
-
-
-def _check_march(
-    sdf: Tensor,
-    brick_min: Tensor,
-    origin: Tensor,
-    direction: Tensor,
-    jitter: Tensor,
-    bricks: Bricks | None,
-) -> None:
-    if bricks is not None:
-        check_bricks("march", bricks, sdf=(sdf, "R"), brick_min=(brick_min, "n"))
-    check(
-        "march",
-        sdf=(sdf, "X Y Z" if bricks is None else "R"),
-        brick_min=(brick_min, "A B C" if bricks is None else "n"),
-        origin=(origin, "N 3"),
-        direction=(direction, "N 3"),
-        jitter=(jitter, "N"),
-    )
-
-
-def _check_ranges(
-    voxel_size: float, step: float, inv_s: float, min_weight: float, early_stop: float
-) -> None:
-    for name, number in (("voxel_size", voxel_size), ("step", step), ("inv_s", inv_s)):
-        if not 0 < number < float("inf"):
-            raise ValueError(f"march: {name} must be positive and finite, got {number}")
-    for name, number in (("min_weight", min_weight), ("early_stop", early_stop)):
-        if not 0 <= number <= 1:
-            raise ValueError(f"march: {name} must be in [0, 1], got {number}")
 
 
 def march_reference(

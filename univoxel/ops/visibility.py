@@ -129,7 +129,9 @@ class VisibilityScene:
         if native.reference_asked():
             return None
         if self._native is None:
-            self._native = _build(self.vertices, self.faces)
+            core = native.require_embree('VisibilityScene outside of use_backend("reference")')
+            arrays = native.arrays(self.vertices, self.faces)
+            self._native = core.VisibilityScene(*arrays, native.threads())
         return self._native
 
 
@@ -184,12 +186,6 @@ def closest_hit_reference(
         uv = torch.stack([u[row, nearest], v[row, nearest]], -1)
         barycentric[s] = torch.where(hit[:, None], uv, 0.0)
     return Hit(t, face, barycentric)
-
-
-def _build(vertices: Tensor, faces: Tensor):
-    """The native scene, or an error that says what is missing and how to get it."""
-    core = native.require_embree('VisibilityScene outside of use_backend("reference")')
-    return core.VisibilityScene(*native.arrays(vertices, faces), native.threads())
 
 
 def _check_indices(faces: Tensor, vertices: Tensor) -> None:

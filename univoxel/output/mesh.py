@@ -248,7 +248,8 @@ def bake(
     if not len(texel):
         raise UserError(f"a texture of {size} x {size} is too small for {len(faces)} faces")
     seen = None if mesh.seen is None else mesh.seen[source]
-    footprint = _texel(mesh, len(texel))
+    area = torch.linalg.cross(*_edges_at(mesh.vertices[mesh.faces.long()], 0))
+    footprint = float((0.5 * area.norm(dim=1).sum() / len(texel)).sqrt())  # world units
     parts, known = [], surface_beside(scene.field, mesh)
     for some, w in zip(face.split(POINTS_AT_ONCE), weight.split(POINTS_AT_ONCE), strict=True):
         corner = faces[some].long()
@@ -268,12 +269,6 @@ def bake(
     *rest, metallic = (torch.cat(p)[place] for p in zip(*parts, strict=True))
     metal = metal_or_none(metallic)
     return TexturedMesh(vertices, faces, normals, tangents, uv, *rest, metallic=metal, seen=seen)
-
-
-def _texel(mesh: Mesh, texels: int) -> float:
-    """World units along a side of one of so many texels on a mesh."""
-    area = torch.linalg.cross(*_edges_at(mesh.vertices[mesh.faces.long()], 0))
-    return float((0.5 * area.norm(dim=1).sum() / texels).sqrt())
 
 
 def _fading(relief: Tensor, seen: Tensor) -> Tensor:

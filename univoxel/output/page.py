@@ -53,15 +53,6 @@ class Transfer:
     bounced: Tensor  # [P, 3, 4] float32, by colour
 
 
-@dataclass(frozen=True)
-class _Sightings:
-    """Rays of vertices that meet the object, M of them."""
-
-    vertex: Tensor  # [M] int64, whose ray
-    corner: Tensor  # [M, 3] int64, of the triangle that it meets
-    weight: Tensor  # [M, 3], of those corners
-
-
 def transfer(mesh: TexturedMesh, offset: float) -> Transfer:
     """Traced from each vertex of a mesh, with its albedo.
 
@@ -76,14 +67,14 @@ def transfer(mesh: TexturedMesh, offset: float) -> Transfer:
     normals = torch.zeros_like(places).index_copy_(0, of_vertex, mesh.normals)
     albedo = torch.zeros_like(places).index_copy_(0, of_vertex, vertex_albedo(mesh))
     faces = of_vertex[mesh.faces.long()]
-    direct, seen = _traced(places, normals, faces, offset)
+    direct, vertex, corner, weight = _traced(places, normals, faces, offset)
     few = (BOUNCE_DEGREE + 1) ** 2
     lit = direct[:, None, :few].expand(-1, 3, -1)
     bounced = torch.zeros_like(lit)
     for _ in range(BOUNCES):
         sent = albedo[:, :, None] * (lit + bounced)
-        met = torch.einsum("mk,mkcl->mcl", seen.weight, sent[seen.corner])
-        bounced = torch.zeros_like(lit).index_add_(0, seen.vertex, met / RAYS)
+        met = torch.einsum("mk,mkcl->mcl", weight, sent[corner])
+        bounced = torch.zeros_like(lit).index_add_(0, vertex, met / RAYS)
     return Transfer(direct[of_vertex], bounced[of_vertex])
 
 
@@ -96,8 +87,9 @@ def vertex_albedo(mesh: TexturedMesh) -> Tensor:
 
 def _traced(
     places: Tensor, normals: Tensor, faces: Tensor, offset: float
-) -> tuple[Tensor, _Sightings]:
-    """Harmonics [P, 25] of the open sky weighted by the cosine over pi, and what hides the rest."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Harmonics [P, 25] of the open sky weighted by the cosine over pi, and of M rays that meet the
+    object: the vertex [M], the corners [M, 3] of the triangle met, and their weights [M, 3]."""
     visibility = VisibilityScene(places, faces)
     local = sphere.fibonacci_hemisphere(RAYS)
     # Evenly over the disc below them: the cosine is in their density
@@ -116,7 +108,8 @@ def _traced(
         u, v = hit.barycentric[met].unbind(1)
         weight = torch.stack([1 - u - v, u, v], 1)
         parts.append((start + met // RAYS, faces[hit.face[met]], weight))
-    return torch.cat(direct), _Sightings(*(torch.cat(part) for part in zip(*parts, strict=True)))
+    vertex, corner, weight = (torch.cat(part) for part in zip(*parts, strict=True))
+    return torch.cat(direct), vertex, corner, weight
 
 
 # The lights that a page offers, and how they are written into it.

@@ -87,15 +87,6 @@ def curves(run: Path) -> list[Curve]:
     return [curve for curve in found if any(curve.pieces)]
 
 
-def configuration(run: Path) -> TrainConfig | None:
-    """What the run was trained with; None if its config.json cannot be read."""
-    try:
-        return load_config(run / "config.json")
-    except (UserError, OSError) as error:
-        log.info("the table of stages is missing: %s", error)
-        return None
-
-
 def stages(cfg: TrainConfig, state: dict[str, Any]) -> list[StageFacts]:
     """The stages of a training, in order."""
     made, early, took = (list(state.get(key, ())) for key in ("made", "early", "took"))
@@ -378,8 +369,10 @@ def training_section(run: Path, state: dict[str, Any]) -> str:
         parts.append(paragraph(CHARTS))
     else:
         parts.append(paragraph("There are no curves, because this run has no log."))
-    cfg = configuration(run)
-    if cfg is None:
+    try:
+        cfg = load_config(run / "config.json")
+    except (UserError, OSError) as error:
+        log.info("the table of stages is missing: %s", error)
         return "\n".join(
             [*parts, paragraph("The table of stages is missing: config.json is not readable.")]
         )

@@ -85,18 +85,6 @@ def irradiance(radiance: Tensor, normal: Tensor) -> Tensor:
     return (radiance * (cosine * texel_solid_angles(height, width))[..., None]).sum((0, 1))
 
 
-def view_of(photos: Photos, view: str) -> int:
-    if view in photos.names:
-        return photos.names.index(view)
-    if view.isdigit() and int(view) < len(photos):
-        return int(view)
-    raise UserError(
-        f"view: expected a number below {len(photos)} or a name from {photos.names[0]} to "
-        f"{photos.names[-1]}, got {view!r}",
-        "view",
-    )
-
-
 def ray_of(photos: Photos, view: int, pixel: tuple[int, int]) -> Rays:
     size = photos.cameras.size(view)
     if not all(0 <= p < n for p, n in zip(pixel, size, strict=True)):

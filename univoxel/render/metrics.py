@@ -13,17 +13,14 @@ from univoxel.core.records import Mesh
 from univoxel.errors import UserError
 
 
-def photometric(
-    encoded: Tensor, target: Tensor, weight: Tensor | None = None, clipped: float = 0.99
-) -> Tensor:
+def photometric(encoded: Tensor, target: Tensor, clipped: float = 0.99) -> Tensor:
     """L1 between sRGB-encoded colours [N, 3].
 
     A photograph's clipped pixel says only that the light was at least so bright: where the target
     is above `clipped`, overshoot costs nothing.
     """
     over = (target > clipped) & (encoded > target)
-    error = torch.where(over, 0.0, (encoded - target).abs()).mean(1)
-    return error.mean() if weight is None else (weight * error).sum() / len(error)
+    return torch.where(over, 0.0, (encoded - target).abs()).mean(1).mean()
 
 
 def silhouette(opacity: Tensor, alpha: Tensor) -> Tensor:

@@ -105,6 +105,12 @@ def at_rays(surface: Surface, index: Tensor) -> Surface:
     return Surface(**{name: x[index] for name, x in vars(surface).items() if x is not None})
 
 
+def joined(parts: list[Surface]) -> Surface:
+    """The surfaces of some rays after another as one."""
+    names = [name for name, x in vars(parts[0]).items() if x is not None]
+    return Surface(**{name: torch.cat([vars(part)[name] for part in parts]) for name in names})
+
+
 def in_light_frame(scene: Scene, surface: Surface, wo: Tensor) -> tuple[Surface, Tensor]:
     """The surface's normals and wo [N, 3] as the light sees them, where it turns with the camera.
 
@@ -200,8 +206,7 @@ def surface_of_view(
             rays.origin.split(RAYS_AT_ONCE), rays.direction.split(RAYS_AT_ONCE), strict=True
         )
     ]
-    names = [name for name, x in vars(parts[0]).items() if x is not None]
-    surface = Surface(**{name: torch.cat([vars(part)[name] for part in parts]) for name in names})
+    surface = joined(parts)
     there = surface.opacity > 0
     if albedo_near is not None and there.any():
         footprint = float(surface.depth[there].median() / cameras.focal[view].mean())

@@ -21,7 +21,6 @@ import torch
 from torch import Tensor
 
 from univoxel import brdf
-from univoxel.lights.latlong import DistantLight
 from univoxel.render.observations import (
     JointProblem,
     MaterialLabels,
@@ -85,7 +84,6 @@ class PaintedPoints:
     color: Tensor  # [P, 3] mean over the photographs
     reach: Tensor  # [P, D] radiance per radiance of the nodes, for albedo 1
     indirect: Tensor  # [P, 3] radiance from occluded directions, for albedo 1
-    cell: float  # log albedo, whose colours count as one
 
     def irradiance(self, sky: Tensor) -> Tensor:
         """Of the points under a map [D, 3], over pi: [P, 3]; above 0."""
@@ -94,7 +92,7 @@ class PaintedPoints:
     def entropy(self, irradiance: Tensor) -> Tensor:
         """Of the albedos, if irradiance over pi [P, K, 3] reaches the points: [K]."""
         log_albedo = (self.color[:, None] / irradiance.clamp_min(DARK)).log()
-        return palette_entropy(log_albedo, self.cell)
+        return palette_entropy(log_albedo, CELL)
 
 
 @dataclass(frozen=True)
@@ -131,7 +129,7 @@ def painted_points(
     if len(point) < max(MIN_POINTS, MIN_PAINT * int(usable.sum())):
         return None
     point = point[torch.randperm(len(point))[:POINTS]]
-    return PaintedPoints(point, color[point], *_reach(problem, point), CELL)
+    return PaintedPoints(point, color[point], *_reach(problem, point))
 
 
 @torch.no_grad()
@@ -154,7 +152,7 @@ def fit_sun_(scene: Scene, problem: JointProblem, decisions: MaterialLabels) -> 
     min_reach = MIN_REACH * problem.solid_angle / math.pi
     power = mean / points.reach.mean(0).clamp_min(min_reach)[:, None]  # [D, 3] for all of the light
     entropy_without_sun = points.entropy(torch.stack([irradiance, overcast], 1)).min()
-    entropy = sun_entropies(points, overcast, power, SUN_SHARES)
+    entropy = sun_entropies(points, overcast, power)
     if entropy.min() > entropy_without_sun - SUN_GAIN:
         return None
     best_share, node = divmod(int(entropy.argmin()), len(power))
@@ -167,20 +165,17 @@ def fit_sun_(scene: Scene, problem: JointProblem, decisions: MaterialLabels) -> 
     return Sun(log_excess, share, (x, y, z))
 
 
-def sun_entropies(
-    points: PaintedPoints, overcast: Tensor, power: Tensor, shares: tuple[float, ...]
-) -> Tensor:
-    """Entropy of the albedos under an even sky with a sun: [K, D], by share and direction.
+def sun_entropies(points: PaintedPoints, overcast: Tensor, power: Tensor) -> Tensor:
+    """Entropy of the albedos under an even sky with a sun: [K, D], by SUN_SHARES and direction.
 
     Args:
         overcast: [P, 3] irradiance over pi under the even sky only.
         power: [D, 3] radiance of a node that would send all of the light.
-        shares: K, of the light that the sun sends.
     """
-    entropy = torch.zeros(len(shares), len(power))
+    entropy = torch.zeros(len(SUN_SHARES), len(power))
     for nodes in torch.arange(len(power)).split(SUNS_AT_ONCE):
         suns = points.reach[:, nodes, None] * power[nodes]
-        for k, share in enumerate(shares):
+        for k, share in enumerate(SUN_SHARES):
             irradiance = (1 - share) * overcast[:, None] + share * suns
             entropy[k, nodes] = points.entropy(irradiance)
     return entropy
@@ -198,7 +193,10 @@ def minimise_entropy_(scene: Scene, problem: JointProblem, decisions: MaterialLa
     if points is None:
         return False
     sky = problem.sky
-    basis = slow_changes(sky, decisions.sun, DEGREE)
+    basis = real_harmonics(DEGREE, sky.direction)[:, 1:]  # [D, R]; the first is constant
+    if decisions.sun is not None:
+        basis = torch.cat([basis, (decisions.sun.amax(1, keepdim=True) > 0).float()], 1)
+    basis = basis / basis.abs().amax(0)
     log_map = sky.log_radiance.detach()
     brightness = points.irradiance(log_map.exp()).log().mean(0)
     lowest = initial = float(points.entropy(points.irradiance(log_map.exp())[:, None]))
@@ -213,15 +211,6 @@ def minimise_entropy_(scene: Scene, problem: JointProblem, decisions: MaterialLa
     # Colours do not determine the scale of light against albedo
     sky.log_radiance.copy_(log_map + brightness - points.irradiance(log_map.exp()).log().mean(0))
     return lowest < initial
-
-
-def slow_changes(sky: DistantLight, sun: Tensor | None, degree: int) -> Tensor:
-    """Functions [D, R] over the nodes of a map, at most 1: harmonics from degree 1 on, and the
-    nodes of a sun."""
-    basis = real_harmonics(degree, sky.direction)[:, 1:]
-    if sun is not None:
-        basis = torch.cat([basis, (sun.amax(1, keepdim=True) > 0).float()], 1)
-    return basis / basis.abs().amax(0)
 
 
 @torch.no_grad()

@@ -116,11 +116,6 @@ def reference_rays(photos: Photos, pixels: Tensor) -> ReferenceRays:
     return ReferenceRays(batch.rays, batch.view, target)
 
 
-def random_reference_rays(photos: Photos, pixels: Tensor, count: int) -> ReferenceRays:
-    """The rays of `count` of the pixels [P, 3] at most, drawn without replacement."""
-    return reference_rays(photos, pixels[torch.randperm(len(pixels))[:count]])
-
-
 def last_within_limit(
     candidates: Sequence[Number], loss_db: Callable[[Number], float], limit_db: float
 ) -> Number:
@@ -493,7 +488,8 @@ def reduce_storage_(
     if not isinstance(scene.field.encoding, NodeFeatures):
         far = (chosen_reach(choices) or SHELL) * scene.field.voxel_size
         probes = (  # drawn one by one: each is dropped before the next is
-            random_reference_rays(photos, pixels, ROW_PROBE_RAYS) for _ in range(ROW_PROBES)
+            reference_rays(photos, pixels[torch.randperm(len(pixels))[:ROW_PROBE_RAYS]])
+            for _ in range(ROW_PROBES)
         )
         choices.append(fewer_rows_(scene, held_out, probes, far, TOLERANCE_DB))
     if cfg.budget_mb:

@@ -281,12 +281,8 @@ def smoothness_losses(
 
 def light_priors(prior: Regularisation, weight: LossConfig) -> dict[str, Tensor]:
     """The priors that a light has, each times its weight."""
-    terms = {
-        "light_smoothness": (weight.light_smoothness, prior.light_smoothness),
-        "map_smoothness": (weight.map_smoothness, prior.map_smoothness),
-        "white_light": (weight.white_light, prior.white_light),
-    }
-    return {name: factor * term for name, (factor, term) in terms.items() if term is not None}
+    terms = {name: term for name, term in vars(prior).items() if term is not None}
+    return {name: getattr(weight, name) * term for name, term in terms.items()}
 
 
 def batch_at(photos: Photos, pixels: Tensor) -> Batch:

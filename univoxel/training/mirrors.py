@@ -117,10 +117,6 @@ class NodeMap:
         column = (u * 2 * ROWS).long() % (2 * ROWS)
         return self.node_at[(v * ROWS).long().clamp_max(ROWS - 1), column]
 
-    def beside(self, count: int) -> Tensor:
-        """The nodes [D, count + 1] next to each, itself among them."""
-        return (self.direction @ self.direction.T).topk(count + 1, 1).indices
-
     def brightest_within(self, degrees: float) -> Tensor:
         """Brightest channel [D] of the nodes around each."""
         near = self.direction @ self.direction.T > math.cos(math.radians(degrees))
@@ -164,7 +160,8 @@ def sees_sky(problem: JointProblem, map: NodeMap, point: Tensor, direction: Tens
     """Whether the sky is where points [N] look [N, ..., 3], and around it: [N, ...] bool."""
     visible, node = problem.transport.visibility == 255, map.nearest(direction)
     row = point.view(-1, *[1] * (node.dim() - 1))
-    near = map.beside(NODE_NEIGHBOURS).unbind(1)
+    cosine = map.direction @ map.direction.T
+    near = cosine.topk(NODE_NEIGHBOURS + 1, 1).indices.unbind(1)  # the node itself among them
     return torch.stack([visible[row, beside[node]] for beside in near]).all(0)
 
 
@@ -231,12 +228,6 @@ def unexplained_change(seen: MirrorObservations, map: NodeMap) -> Tensor:
     return seen.mean((shown - factor[:, None] * mirrored).abs().mean(2))
 
 
-def bounded(factor: Tensor, brightest: float) -> Tensor:
-    """Factors [N, 3] of at most 1, their largest channel at least as bright as that."""
-    factor = factor.clamp(1e-3, 1.0)
-    return (factor * (brightest / factor.amax(1, keepdim=True)).clamp_min(1.0)).clamp_max(1.0)
-
-
 def reflectance(
     seen: MirrorObservations, map: NodeMap, metal: Tensor, sharp: Tensor, nearest: Tensor
 ) -> Tensor:
@@ -268,8 +259,11 @@ def reflectance(
 
 
 def ratio(shown: Tensor, sent: Tensor) -> Tensor:
-    """Base colours [N, 3] that send on as much of what is sent [N, 3] as is shown [N, 3]."""
-    return bounded(shown / sent.clamp_min(1e-3), MIN_REFLECTANCE)
+    """Base colours [N, 3] that send on as much of what is sent [N, 3] as is shown [N, 3]: at
+    most 1, the largest channel at least as bright as metals are."""
+    factor = (shown / sent.clamp_min(1e-3)).clamp(1e-3, 1.0)
+    brighter = (MIN_REFLECTANCE / factor.amax(1, keepdim=True)).clamp_min(1.0)
+    return (factor * brighter).clamp_max(1.0)
 
 
 def regions_of(inside: Tensor, nearest: Tensor) -> tuple[Tensor, int]:

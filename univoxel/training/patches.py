@@ -120,10 +120,12 @@ def own_patches(
 ) -> tuple[Tensor, Tensor]:
     """Brightness [N, M] of the pixels around pixels [N], and whether they can be compared [N]."""
     height, width = brightness.shape[1:]
-    rows, columns = patch_pixels(row, column)
+    step = torch.arange(-HALF, HALF + 1)
+    down, right = (t.flatten() for t in torch.meshgrid(step, step, indexing="ij"))
+    rows, columns = row[:, None] + down, column[:, None] + right
     inside = ((rows >= 0) & (columns >= 0) & (rows < height) & (columns < width)).all(1)
     rows, columns = rows.clamp(0, height - 1), columns.clamp(0, width - 1)
-    own = pixels_at(brightness, view[:, None], rows, columns)
+    own = brightness.view(-1)[(view[:, None] * height + rows) * width + columns].float()
     textured = (own - own.mean(1, keepdim=True)).square().mean(1).sqrt() > MIN_TEXTURE
     return own, inside & textured & (own >= 0).all(1)
 
@@ -157,13 +159,6 @@ def views_beside(
     return others.gather(1, first), seen.gather(1, first)
 
 
-def patch_pixels(row: Tensor, column: Tensor) -> tuple[Tensor, Tensor]:
-    """Rows and columns [N, M] of the pixels of patches around pixels [N]."""
-    step = torch.arange(-HALF, HALF + 1)
-    down, right = (t.flatten() for t in torch.meshgrid(step, step, indexing="ij"))
-    return row[:, None] + down, column[:, None] + right
-
-
 def patch_directions(cameras: Cameras, view: Tensor, row: Tensor, column: Tensor) -> Tensor:
     """Directions [N, 3, 3] through the middles of patches, 1 along the camera's axis, and what a
     column and a row add to them."""
@@ -175,9 +170,3 @@ def patch_directions(cameras: Cameras, view: Tensor, row: Tensor, column: Tensor
     away = torch.stack([column, row], 1) + 0.5 - cameras.centre[view]
     middle = away[:, :1] * by_column + away[:, 1:] * by_row - back
     return torch.stack([middle, by_column, by_row], 1)
-
-
-def pixels_at(brightness: Tensor, view: Tensor, row: Tensor, column: Tensor) -> Tensor:
-    """Brightness of pixels, of the shape that view, row and column have together."""
-    height, width = brightness.shape[1:]
-    return brightness.view(-1)[(view * height + row) * width + column].float()

@@ -150,7 +150,10 @@ def check_memory(photos: Photos, cfg: TrainConfig, there: Memory | None = None) 
     left = there.total if there.free is None else there.free
     if further <= left:
         return
-    factor = _factor(photos, further, left)
+    # Pixels of the files that have to become one along a side, if that is enough
+    pixels = PER_PIXEL * photos.alpha.numel()
+    rest = left - (further - pixels)
+    factor = math.ceil(photos.downscale * math.sqrt(pixels / rest)) if rest > 0 else None
     what = (
         f"training on {len(photos)} photographs of {photos.cameras.width}x{photos.cameras.height} "
         f"pixels needs about {(further + have) / 1e9:.1f} GB; {left / 1e9:.1f} of "
@@ -164,12 +167,3 @@ def check_memory(photos: Photos, cfg: TrainConfig, there: Memory | None = None) 
         *(what, change),
         extra={"arguments": ("downscale", "preset")},
     )
-
-
-def _factor(photos: Photos, further: int, left: int) -> int | None:
-    """How many pixels of the files have to become one along a side; None: that is not enough."""
-    pixels = PER_PIXEL * photos.alpha.numel()
-    rest = left - (further - pixels)
-    if rest <= 0:
-        return None
-    return math.ceil(photos.downscale * math.sqrt(pixels / rest))

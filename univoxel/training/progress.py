@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal, Protocol, TypeAlias
 
 import torch
@@ -38,14 +38,8 @@ class CapacityChoice:
 
     def as_json(self) -> dict[str, Any]:
         """The choice as an entry of a run's state."""
-        return {
-            "what": self.kind,
-            "before": self.before,
-            "after": self.after,
-            "cost": self.cost,
-            "why": self.why,
-            "said": self.sentence,
-        }
+        values = asdict(self)
+        return {"what": values.pop("kind"), **values, "said": self.sentence}
 
     @staticmethod
     def from_json(entry: dict[str, Any]) -> CapacityChoice:

@@ -20,7 +20,7 @@ from univoxel.core.choices import BOUNCES
 from univoxel.core.records import Rays, Surface
 from univoxel.evaluation.confidence import ALBEDO_LIMIT
 from univoxel.render.pictures import heat
-from univoxel.render.pipeline import at_rays, surface_at
+from univoxel.render.pipeline import at_rays, joined, surface_at
 from univoxel.render.relight import Lighting, ground_shadow, relight_surface
 from univoxel.viewer.viewer_scene import Subject, at_hits, surface_along
 
@@ -140,7 +140,7 @@ def refined_pictures(
     for index in torch.arange(len(rays.origin)).split(STEP_RAYS):
         steps.append(surface_at(subject.scene, _at(rays, index)))
         yield None
-    surface, wo = _joined(steps), -rays.direction
+    surface, wo = joined(steps), -rays.direction
     if look.layer != "render":
         yield _layer(subject, cameras, look.layer, surface)
         return
@@ -244,11 +244,6 @@ def _accumulated_(
         if len(some):
             mean[some] += share * (render(some) - mean[some])
         yield None
-
-
-def _joined(parts: list[Surface]) -> Surface:
-    names = [name for name, x in vars(parts[0]).items() if x is not None]
-    return Surface(**{name: torch.cat([vars(part)[name] for part in parts]) for name in names})
 
 
 def _at(rays: Rays, index: Tensor) -> Rays:
