@@ -283,7 +283,7 @@ def two_fit(folder):
         (
             write_nerfstudio,
             text("transforms.json", ('"k1": 0.0', '"k5": 0.1')),
-            "expected only distortion by k1 k2 k3 p1 p2, got k5",
+            "expected only distortion k1 k2 k3 p1 p2, got k5",
         ),
         (
             lambda f, s: write_colmap(

@@ -182,7 +182,7 @@ def test_splits_that_cannot_be_made(tmp_path, writer):
     with pytest.raises(DataError, match="one: expected at least two photographs, found 1"):
         load_photos(tmp_path / "one")
     writer(tmp_path / "two", scene(views=2))
-    with pytest.raises(DataError, match="two: expected split train or test, got val"):
+    with pytest.raises(DataError, match="two: expected train or test as the split, got val"):
         load_photos(tmp_path / "two", "val")
     assert load_photos(tmp_path / "two", "test").names == ["p_000"]
 

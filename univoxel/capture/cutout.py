@@ -184,7 +184,7 @@ def cutout(
     """
     data, out, origin = Path(data), Path(out), str(source)
     if out.exists():
-        raise ExistingFile(f"{out} exists already: choose another folder for out", "out")
+        raise ExistingFile(f"{out} already exists: choose another folder for out", "out")
     check_masks(origin, network, box, keep_table)
     corners = None if box is None else object_shape.box_corners(box)
     masked = mask_network(network) if origin == REMBG else None
@@ -228,8 +228,8 @@ def check_masks(origin: str, network: str, box: Sequence[float] | None, keep_tab
     if keep_table and (box is None or origin != DEPTH):
         got = "no box" if box is None else f"masks from {origin}"
         raise UserError(
-            f"keep_table needs a box that bounds the table, and masks from depth ({DEPTH}), "
-            f"got {got}",
+            f"keep_table needs a box that bounds the table, and masks from depth (source: "
+            f"{DEPTH}), got {got}",
             "keep_table",
         )
 
@@ -246,11 +246,11 @@ def _from_depth(
         raise DataError(
             f"{splits['train'].folder}: depth does not separate the object from its surroundings. "
             f"Depth needs a textured object and cameras all around it. If you do not have these, "
-            f"use source={REMBG} or a folder of masks instead of {DEPTH}",
+            f"use source={REMBG} or a folder of masks instead of source={DEPTH}",
             "source",
         )
     _tell_evidence(shape, 0, box)
-    log.info("masks were made from depth: check masks.html")
+    log.info("masks were made from depth: check them in masks.html")
     return {name: _silhouettes_of(shape, split) for name, split in splits.items()}
 
 
@@ -325,12 +325,14 @@ def _judged(
             for stem, one in zip(split.names, masks[name], strict=True):
                 if not bool((one >= 128).any()):
                     where = "" if box is None else " inside the box"
-                    raise DataError(f"{split.folder}: the mask of {stem} is empty{where}")
+                    raise DataError(
+                        f"{split.folder}: the mask of {stem} is empty{where}: correct it"
+                    )
         log.warning(
             "masks are not checked, because that needs %d photographs and there are only %d",
             *(PHOTOGRAPHS, count),
         )
-        return _as_they_are(masks), "the masks are unchecked: there are too few photographs"
+        return _as_they_are(masks), "masks are not checked, because there are too few photographs"
     coverage = {name: [m.float() / 255 for m in those] for name, those in masks.items()}
     shape = object_shape.find_object(coverage["train"], depth_maps(train), box=box)
     _tell_evidence(shape, count, box)

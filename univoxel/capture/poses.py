@@ -257,7 +257,9 @@ def _search(
         stands = f"the background is static in {still} of {matching} pairs of photographs"
         if capture.masks is None:
             raise StillBackground(stands)
-        raise DataError(f"{stands}, and the masks include part of it: tighten the masks", "masks")
+        raise DataError(
+            f"{stands}, and the images in masks include part of it: tighten these masks", "masks"
+        )
     do(MODELS, structure.place, total)
     return unreadable
 
@@ -299,8 +301,9 @@ def _judge(capture: Capture, folders: Folders, unreadable: dict[int, str]) -> Fo
     if len(placed) < PLACED_SHARE * len(reports):
         missing = [f"{r.name} ({r.reason})" for r in reports if not r.placed]
         raise DataError(
-            f"only {len(placed)} of {len(reports)} photographs were registered. Take more, with "
-            f"more overlap, and do not move the object. Not registered: {_some(missing)}"
+            f"only {len(placed)} of {len(reports)} photographs were registered. Take more "
+            "photographs, with more overlap, and do not move the object. "
+            f"Not registered: {_some(missing)}"
         )
     return Found(models[0], weak, reports)
 
@@ -343,7 +346,7 @@ def _say(capture: Capture, found: Found, total: int, keep_weak: bool) -> None:
 
 
 def _aside(unread: list[str], doubles: int) -> str:
-    told = f"; {doubles} exist in two formats, of which one is used" if doubles else ""
+    told = f"; {doubles} photographs exist in two formats, of which one is used" if doubles else ""
     return told + (f"; {len(unread)} could not be read: {_some(unread)}" if unread else "")
 
 

@@ -49,7 +49,7 @@ class RelightOptions:
         tuple[tuple[float, ...], ...],
         written("AZIMUTH ELEVATION IRRADIANCE [ANGLE]", name="sun", repeatable=True),
     ] = ()
-    """distant light; angles in degrees, ANGLE is its diameter (0.53); repeatable"""
+    """distant light; angles in degrees; ANGLE: its diameter, default 0.53; repeatable"""
     point_lights: Annotated[
         tuple[tuple[float, float, float, float], ...],
         written("X Y Z INTENSITY", name="point", repeatable=True),
@@ -58,7 +58,7 @@ class RelightOptions:
     cameras: Annotated[str, written("test|orbit|FILE")] = "test"
     """test views, an orbit around the object, or a path from a transforms.json"""
     ground: Annotated[str | None, written("lowest|HEIGHT")] = None
-    """add a floor that receives shadows, at this height or below the lowest point"""
+    """add a floor that receives shadows, at this height or at the lowest point"""
     elevation: Annotated[float, written("DEGREES", advanced=True)] = ELEVATION
     """elevation of an orbit above the horizon"""
     turn: Annotated[int | None, written("FRAMES", advanced=True)] = None
@@ -128,7 +128,7 @@ class Relight(RelightOptions, Where):  # whose fields come first
     animation: Annotated[tuple[Animation, ...], written(default="none")] = ()
     """also write the frames as an animation"""
     resume: bool = False
-    """keep frames that already exist"""
+    """keep frames that already exist, and render only the others"""
 
 
 @takes(Relight)

@@ -457,7 +457,7 @@ def _stored(picture: Tensor, of_color: torch.dtype, of_alpha: torch.dtype) -> tu
 def every_eighth(folder: Path, shots: Sequence[Shot], split: str) -> list[Shot]:
     """The test split: the first of every eight photographs in order of names; train: the others."""
     if split not in ("train", "test"):
-        raise DataError(f"{folder}: expected split train or test, got {split}")
+        raise DataError(f"{folder}: expected train or test as the split, got {split}")
     ordered = sorted(shots, key=lambda shot: shot.name)
     chosen = [s for i, s in enumerate(ordered) if (i % TEST_EVERY == 0) == (split == "test")]
     if not chosen:
@@ -577,6 +577,6 @@ def _check(folder: Path, shots: Sequence[Shot], downscale: int) -> None:
         width, height = shot.lens.width, shot.lens.height
         if downscale > min(width, height):
             raise DataError(
-                f"{folder}: downscale={downscale} is too large for {width}x{height} pixels",
+                f"{folder}: downscale={downscale} is too large for {width}x{height} images",
                 "downscale",
             )

@@ -87,8 +87,8 @@ class ViewLights(nn.Module):
             self.chosen = int(view)
         else:
             raise UserError(
-                f"light_of: expected a number below {len(self)} or a name from {self.names[0]} to "
-                f"{self.names[-1]}, got {view!r}",
+                f"light_of: expected the number of a view (below {len(self)}) or its name (from "
+                f"{self.names[0]} to {self.names[-1]}), got {view!r}",
                 "light_of",
             )
 
@@ -204,7 +204,7 @@ class Table:
     axis: Vec3 = field(metadata=about("unit vector along the axis, pointing up"))
     start: Vec3 = field(metadata=about("unit vector from the axis to the first camera"))
     eyes: tuple[Vec3, ...] = setting(
-        (), "positions of the cameras around this axis; empty: those of all cameras"
+        (), "positions of the cameras around this axis; empty: all cameras are around it"
     )
 
     def __post_init__(self) -> None:
@@ -255,7 +255,7 @@ class Turntable(Table):
     turned over to show its underside, the photographs after that have another axis, in `others`.
     """
 
-    others: tuple[Table, ...] = setting((), "rotation axes of the object's other positions")
+    others: tuple[Table, ...] = setting((), "rotation axes for the other positions of the object")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -151,7 +151,7 @@ def relight(
     materials = _materials(scene, mesh, mesh_f0) if bounces else (None,) * 4
     traced = scene.native()
     if traced is None:
-        raise RuntimeError("relight: runs on the native backend only, got use_backend('reference')")
+        raise RuntimeError("relight needs the native backend, got use_backend('reference')")
     lights = (tables, _pack_suns(suns), _pack_point_lights(point_lights))
     numbers = (offset, first, samples, bounces, seed)
     points = (*points, _rows_of_f0(f0, position))

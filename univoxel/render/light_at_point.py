@@ -91,8 +91,8 @@ def view_of(photos: Photos, view: str) -> int:
     if view.isdigit() and int(view) < len(photos):
         return int(view)
     raise UserError(
-        f"view: expected a number below {len(photos)} or a name from {photos.names[0]} to "
-        f"{photos.names[-1]}, got {view!r}",
+        f"view: expected the number of a view (below {len(photos)}) or its name (from "
+        f"{photos.names[0]} to {photos.names[-1]}), got {view!r}",
         "view",
     )
 
@@ -101,7 +101,7 @@ def ray_of(photos: Photos, view: int, pixel: tuple[int, int]) -> Rays:
     size = photos.cameras.size(view)
     if not all(0 <= p < n for p, n in zip(pixel, size, strict=True)):
         raise UserError(
-            f"pixel: expected a pixel inside {size[0]}x{size[1]}, got {pixel[0]},{pixel[1]}",
+            f"pixel: expected a pixel of a {size[0]}x{size[1]} image, got {pixel[0]},{pixel[1]}",
             "pixel",
         )
     return pixel_rays(photos.cameras, torch.tensor([view]), torch.tensor([pixel]) + 0.5)
