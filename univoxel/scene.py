@@ -41,7 +41,7 @@ class SceneConfig:
 
     channels: int = setting(16, "number of features per voxel", least=1)
     material_channels: int = setting(
-        8, "number of features from which albedo and roughness are decoded", least=1
+        8, "number of features from which the material head decodes the material", least=1
     )
     hidden: int = setting(64, "width of the material and radiance heads", least=1)
     mirror_levels: int = setting(5, "levels of the table of reflected directions", least=0, most=8)

@@ -242,7 +242,7 @@ BROKEN = {
     ),
     "empty path": (frame(file_path=""), "train.json: missing images"),
     "double name": (frame(file_path="./train/r_0.png"), "frame 1: the name r_0 .* occurs twice"),
-    "distortion by k4": (frame(k4=0.1), "frame 1: expected only distortion k1 k2 k3 p1 p2"),
+    "distortion by k4": (frame(k4=0.1), "frame 1: expected only distortion terms k1 k2 k3 p1 p2"),
     "distortion in words": (frame(k2="no"), "frame 1: expected k2 between -inf and inf, got 'no'"),
     "too much distortion": (root(k1=20.0), "frame 0: removing lens distortion would leave"),
     "folding distortion": (root(k1=-10.0, k2=30.0), "frame 0: the lens distortion folds the"),

@@ -94,7 +94,7 @@ SENSOR = '<sensor id="3" label="unknown" type="frame">'
         (edited(("<f>11.0</f>", "")), "camera p_000: expected a number for f, got nothing"),
         (edited(("<f>11.0", "<f>wide")), "camera p_000: expected a number for f, got 'wide'"),
         (edited(("<f>11.0", "<f>-11.0")), "camera p_000: expected fl_x between 0 and inf"),
-        (edited(("<f>11.0", "<p3>.1</p3><f>11.0")), "expected distortion k1 to k4, p1 and p2"),
+        (edited(("<f>11.0", "<p3>.1</p3><f>11.0")), "expected distortion terms k1 to k4"),
         (edited(("<f>11.0", "<b2>2</b2><f>11.0")), "p_000: expected perpendicular rows"),
         (edited(('width="12"', 'width="0"')), "camera p_000: expected a resolution above 0,"),
         (edited(('width="12"', "")), "camera p_000: expected a number for width, got nothing"),

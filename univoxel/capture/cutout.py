@@ -167,17 +167,17 @@ def cutout(
 
     Args:
         out: folder to write to.
-        source: source of the masks: rembg, a network; none, depth only, which finds the object
-            that stands on a table in the middle; else a folder of masks.
+        source: source of the masks: rembg (a network); none (depth maps, which show the object
+            that stands on a table in the middle); or a folder of masks.
         downscale: photographs are reduced to 1/N; 0: as in `load_photos`.
         allow_outside: as in `load_photos`.
         network: rembg's network to use.
-        box: X0 Y0 Z0 X1 Y1 Z1, a box around the object in the world of the written cameras.
-        keep_table: with masks from depth, keep the table inside the box.
+        box: X0 Y0 Z0 X1 Y1 Z1, a box around the object, in world coordinates of the new cameras.
+        keep_table: with masks from depth, keep the part of the table that is inside the box.
 
     Raises:
         DataError: photographs or masks cannot be used, or depth separates no object.
-        ExistingFile: out exists already.
+        ExistingFile: out already exists.
         MissingExtra: the network is not installed.
         UserError: the masks have nothing in common, or arguments are inconsistent.
         OSError: a file cannot be written.

@@ -53,9 +53,9 @@ class ExportOptions:
     size: Annotated[float | None, written("METRES", "as photographed")] = None
     """length of the object's longest side"""
     origin: Annotated[choices.Origin, ADVANCED] = "upright"
-    """position of the origin; world: as in the data set; upright: there, with +Z up"""
+    """position of the origin; world: as in the data set; upright: the same, with +Z up"""
     lods: Annotated[int, written("N", advanced=True)] = 0
-    """also write N coarser meshes, each with a quarter of the triangles of the last"""
+    """also write N coarser meshes, each with 1/4 of the triangles of the one before"""
 
     def __post_init__(self) -> None:
         if self.faces is not None and self.faces < 4:

@@ -99,7 +99,7 @@ def list_colmap(folder: Path, split: str) -> Listed:
         shots.append(Shot(name, str(images_file), path, None, image.pose, lens))
     note = f" (looked in {folder / 'images'} and {folder})"
     lost = left_out(str(images_file), missing, len(images), note)
-    lost += [f"{scaled} cameras scaled to smaller images"] if scaled else []
+    lost += [f"{scaled} cameras scaled to match smaller images"] if scaled else []
     if len(models) > 1:
         lost = [f"{model.relative_to(folder)}, the largest of {len(models)} models", *lost]
     return turned_up(folder, split, "COLMAP model", shots, lost, listed_split)

@@ -513,7 +513,7 @@ def upright(shots: Sequence[Shot]) -> tuple[list[Shot], list[str]]:
     held = np.stack([_right_and_up(shot) for shot in shots])
     up = up_direction(held)
     if up is None:
-        return shots, [*moved, "world not rotated, because cameras do not show which way is up"]
+        return shots, [*moved, "world not rotated, because the cameras do not show which way is up"]
     if up[2] >= math.cos(LEAN):
         return shots, moved
     turned = in_moved_world(shots, np.column_stack([turn_to_z(up), np.zeros(3)]))

@@ -182,7 +182,7 @@ def _sensor_lens(sensor: ET.Element | None, where: str) -> Lens:
     focal = parsed(calibration.findtext("f"), "f", where)
     term = {key: parsed(calibration.findtext(key, "0"), key, where) for key in TERMS}
     if term["p3"] or term["p4"]:
-        raise DataError(f"{where}: expected distortion k1 to k4, p1 and p2 only, got p3 or p4")
+        raise DataError(f"{where}: expected distortion terms k1 to k4, p1 and p2, got p3 or p4")
     values = {"fl_x": focal + term["b1"], "fl_y": focal}
     values |= {"cx": width / 2 + term["cx"], "cy": height / 2 + term["cy"]}
     values |= {"p1": term["p2"], "p2": term["p1"]}

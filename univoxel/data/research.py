@@ -78,7 +78,7 @@ def _rows(path: Path) -> np.ndarray:
     if rows.ndim != 2 or rows.shape[1] != COLUMNS:
         raise DataError(f"{path}: expected rows of {COLUMNS} numbers, got shape {np.shape(rows)}")
     if rows.dtype.kind not in "fiu" or not len(rows):
-        raise DataError(f"{path}: expected rows of {COLUMNS} numbers, got {len(rows)} {rows.dtype}")
+        raise DataError(f"{path}: expected rows of numbers, got {len(rows)} rows of {rows.dtype}")
     return rows.astype(np.float64)
 
 

@@ -159,7 +159,7 @@ def read_frames(path: Path) -> tuple[dict[str, Any], list[load_images.Shot], lis
             "larger images, add the width and height of those as w and h",
             *(path, first.width, first.height),
         )
-    lost += [f"{scaled} cameras scaled to smaller images"] if scaled else []
+    lost += [f"{scaled} cameras scaled to match smaller images"] if scaled else []
     return root, shots, lost
 
 
@@ -331,7 +331,7 @@ def lens_of(values: dict[str, Any], where: str, width: int, height: int, note: s
             + ("a fisheye" if values.get("is_fisheye") else short(model))
         )
     if more := [key for key in ("k4", "k5", "k6") if values.get(key)]:
-        raise DataError(f"{where}: expected only distortion k1 k2 k3 p1 p2, got {more[0]}")
+        raise DataError(f"{where}: expected only distortion terms k1 k2 k3 p1 p2, got {more[0]}")
     if "fl_x" in values:
         x = read_number(values, "fl_x", where, 0.0, math.inf)
         y = read_number(values, "fl_y", where, 0.0, math.inf) if "fl_y" in values else x

@@ -459,7 +459,7 @@ class AdviceConfig:
         least=0,
         most=1,
     )
-    share: float = setting(0.5, "minimum worth, relative to that of the best one", least=0, most=1)
+    share: float = setting(0.5, "minimum worth, relative to the best photograph", least=0, most=1)
 
     __post_init__ = check_settings
 

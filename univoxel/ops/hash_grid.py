@@ -97,8 +97,8 @@ def check_levels(
     each = rows // levels
     if each * levels != rows or each < 1 or each & (each - 1) or each > 2**31:
         raise ValueError(
-            f"{op}: table must have the same power of two of rows for each of {levels} levels, "
-            f"got {rows} rows in all"
+            f"{op}: the number of rows of table per level must be a power of two, got {rows} "
+            f"rows for {levels} levels"
         )
 
 

@@ -78,7 +78,7 @@ def _guard(server: Any, host: str) -> None:
         websocket = inner._live_connections[connection.client_id]
         headers = websocket.request.headers
         if not same_site(headers.get("Origin"), headers.get("Host"), host):
-            log.warning("refused a page of %s access to the viewer", headers.get("Origin"))
+            log.warning("refused a web page of %s access to the viewer", headers.get("Origin"))
             await websocket.close(1008, "another site")
 
 
