@@ -171,7 +171,9 @@ def test_cameras_on_their_side_do_not_say_what_is_up(tmp_path):
     turn[:2, :2] = [[0, -1], [1, 0]]
     lying = written.poses @ turn
     photos = load_photos(write_colmap(tmp_path, type(written)(lying, written.pictures)))
-    assert photos.about.endswith("world not rotated, because cameras do not show which way is up")
+    assert photos.about.endswith(
+        "world not rotated, because the cameras do not show which way is up"
+    )
     wanted = torch.from_numpy(lying[written.split("train"), :3, 3]).float()
     torch.testing.assert_close(photos.cameras.camera_to_world[:, :, 3], wanted)
 

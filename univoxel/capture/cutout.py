@@ -329,7 +329,7 @@ def _judged(
                         f"{split.folder}: the mask of {stem} is empty{where}: correct it"
                     )
         log.warning(
-            "masks are not checked, because that needs %d photographs and there are only %d",
+            "masks are not checked, because this needs %d photographs and there are only %d",
             *(PHOTOGRAPHS, count),
         )
         return _as_they_are(masks), "masks are not checked, because there are too few photographs"

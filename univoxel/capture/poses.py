@@ -340,7 +340,7 @@ def _say(capture: Capture, found: Found, total: int, keep_weak: bool) -> None:
         fate = "kept" if keep_weak else "left out (keep_weak keeps them)"
         log.warning(
             f"{len(weak)} photographs may have poses that are wrong by several degrees. They are "
-            f"{fate}: {_some(weak)}. Photograph that side of the object again with more overlap",
+            f"{fate}: {_some(weak)}. Photograph the side that they show again, with more overlap",
             extra={"arguments": ("keep_weak",)},
         )
 

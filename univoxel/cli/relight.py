@@ -62,7 +62,7 @@ class RelightOptions:
     elevation: Annotated[float, written("DEGREES", advanced=True)] = ELEVATION
     """elevation of an orbit above the horizon"""
     turn: Annotated[int | None, written("FRAMES", advanced=True)] = None
-    """keep the first camera and rotate the light once in this number of frames"""
+    """use the first camera, and rotate the light once around in this many frames"""
     resolution: Annotated[int | None, written("PIXELS", "as photographed; orbits: 512")] = None
     """width of the images"""
     rotate: Annotated[float, written("DEGREES", advanced=True)] = 0.0
@@ -124,7 +124,7 @@ class RelightOptions:
 @dataclass(frozen=True, kw_only=True)
 class Relight(RelightOptions, Where):  # whose fields come first
     orbit: Annotated[int | None, written("FRAMES")] = None
-    """orbit around the object in this number of frames"""
+    """orbit around the object once in this many frames"""
     animation: Annotated[tuple[Animation, ...], written(default="none")] = ()
     """also write the frames as an animation"""
     resume: bool = False

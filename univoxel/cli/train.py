@@ -110,7 +110,7 @@ class TrainOptions:
 @dataclass(frozen=True, kw_only=True)
 class Train(TrainOptions):
     resume: bool = False
-    """resume the run in --out, or start it if nothing was saved yet"""
+    """resume the run in --out, or start a new run if nothing was saved yet"""
     timelapse: Annotated[
         str | None, parsing.written("FILE.gif|FILE.mp4|DIR/", "none", advanced=True)
     ] = None
