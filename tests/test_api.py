@@ -105,12 +105,12 @@ def test_options_of_the_command_are_arguments(monkeypatch):
     assert cfg.stages[1].field == "sparse"
     with pytest.raises(TypeError, match="colour"):
         univoxel.train("photos", "run", colour="red")
-    with pytest.raises(TypeError, match="expected a configuration or preset, got both"):
+    with pytest.raises(TypeError, match="pass either a configuration or preset, not both"):
         univoxel.train(cfg, preset="draft")
 
 
 def test_what_is_wrong_is_one_line(data, tmp_path):
-    with pytest.raises(TypeError, match="out must be the folder to write"):
+    with pytest.raises(TypeError, match="out is missing: pass the folder"):
         univoxel.train(data)
     with pytest.raises(DataError, match="expected a folder with a scene"):
         univoxel.train(tmp_path / "nothing", tmp_path / "run")

@@ -129,7 +129,7 @@ def test_capture_until_a_step(calls, capsys):
     assert capsys.readouterr().out == "mug/cut\n"
     assert calls.noted[0][2] == {"masks": "auto", "until": "masks", **USUAL}
     assert main(["capture", "photos", "--out", "mug", "--until", "cameras", "--minutes", "2"]) == 2
-    said = "with --until cameras, leave out --preset, --light, --minutes and --set"
+    said = "--until cameras does not train: leave out --preset, --light, --minutes and --set"
     assert said in capsys.readouterr().err
 
 

@@ -126,8 +126,8 @@ def test_ends_of_the_unit_square():
 @pytest.mark.parametrize(
     ("radiance", "options", "message"),
     [
-        (torch.ones(4, 4, 3), {}, r"twice as wide as high .*got \[4, 4, 3\]"),
-        (torch.ones(4, 8), {}, r"expected \[H, W, 3\].*got \[4, 8\]"),
+        (torch.ones(4, 4, 3), {}, r"with W = 2 H, got \[4, 4, 3\]"),
+        (torch.ones(4, 8), {}, r"an array \[H, W, 3\].*got \[4, 8\]"),
         (torch.ones(0, 0, 3), {}, r"got \[0, 0, 3\]"),
         (torch.ones(4, 8, 3).double(), {}, "expected float32 radiance, got torch.float64"),
         (-torch.ones(4, 8, 3), {}, "at least 0, got -1.0 in row 0, column 0 and 95 more"),

@@ -144,5 +144,5 @@ def test_only_training_follows_the_cameras():
 
 def test_other_photographs_are_refused():
     _, found = poses()
-    with pytest.raises(ValueError, match="poses for 12 photographs, got 5"):
+    with pytest.raises(ValueError, match=r"the 12 photographs whose .* got 5"):
         found.corrected(cameras_around(5))

@@ -89,7 +89,7 @@ def test_every_field_is_explained():
         (TRAIN, {"masks": "wide"}, "masks must be auto or given, got 'wide'"),
         (TRAIN, {"cameras": "wrong"}, "cameras must be auto, given or refined, got 'wrong'"),
         (TRAIN, {"capacity": "elastic"}, "capacity must be fixed or adaptive, got 'elastic'"),
-        (TRAIN, {"budget_mb": 1.0}, "budget_mb 1 needs adaptive capacity, got fixed"),
+        (TRAIN, {"budget_mb": 1.0}, "budget_mb=1 needs capacity=adaptive, got fixed"),
         (TRAIN, {"light_frame": "moon"}, "light_frame must be auto, world, turntable or camera"),
         (JointConfig(), {"rays": 3}, "rays must be at least views, got 3"),
         (SceneConfig(), {"material_channels": 99}, r"at most channels \(16\), got 99"),

@@ -202,7 +202,7 @@ def test_a_file_whose_field_has_other_channels_is_refused(tmp_path):
     levels = Levels.of(grid.bounds(), grid.voxel_size, 1 + scene.cfg.channels // 2)
     scene.field = hash_field(grid, levels, scene.field.sdf.detach())
     save_scene(scene, tmp_path, {})
-    with pytest.raises(ValueError, match="the field has 6 channels, the networks use 4"):
+    with pytest.raises(ValueError, match="the field has 6 channels, but the networks use 4"):
         load_scene(tmp_path)
 
 
@@ -338,5 +338,5 @@ def test_tensors_that_do_not_fit(tmp_path, scene, name, tensor):
     tensors = load_file(path)
     tensors[name] = tensor
     save_file(tensors, path, meta)
-    with pytest.raises(ValueError, match="the tensors do not match their description"):
+    with pytest.raises(ValueError, match="the tensors do not match the header"):
         load_scene(tmp_path)

@@ -24,7 +24,7 @@ def test_a_good_run():
     ("name", "usable", "retake", "reason", "remedy"),
     [
         ("psnr", 24.0, 15.0, "validation PSNR 24.0 dB", "take sharp photographs"),
-        ("outline", 0.05, 0.2, "5% of the outline", "correct the masks"),
+        ("outline", 0.05, 0.2, "5% of the validation pixels", "correct the masks"),
         ("hidden", 0.4, 0.7, "40% of the surface is seen by too few", "more photographs"),
         ("residual", 0.3, 0.9, "30% of the surface differs", "--preset full"),
     ],

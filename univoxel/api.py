@@ -265,9 +265,9 @@ def train(
     watched = {"timelapse": timelapse, "on_progress": on_progress, "view": view}
     if isinstance(data, TrainConfig):
         if options:
-            raise TypeError(f"train: expected a configuration or {', '.join(options)}, got both")
+            raise TypeError(f"train: pass either a configuration or {', '.join(options)}, not both")
         return train_config(data, resume=resume or out is True, **watched)
     if out is None or isinstance(out, bool):
-        raise TypeError("train: out must be the folder to write the run to, got none")
+        raise TypeError("train: out is missing: pass the folder to write the run to")
     config = TrainOptions(data=data, out=out, **options).configuration()
     return Run(train_config(config, resume=resume, **watched))

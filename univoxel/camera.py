@@ -285,7 +285,7 @@ class PoseSteps(nn.Module):
         """
         if len(cameras) != len(self):
             raise UserError(
-                f"the run has refined camera poses for {len(self)} photographs, got "
+                f"expected the {len(self)} photographs whose camera poses the run refined, got "
                 f"{len(cameras)} photographs"
             )
         steps = self.steps if self.training else self.steps.detach()

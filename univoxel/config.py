@@ -49,12 +49,12 @@ class StageConfig:
 
     voxels: float = field(
         metadata=about(
-            "maximum number of voxels in the box; see voxel_pixels", unit="millions", above=0
+            "maximum number of grid voxels; voxel_pixels may lower it", unit="millions", above=0
         )
     )
-    iterations: int = field(metadata=about("number of steps; fewer if time runs out", least=1))
+    iterations: int = field(metadata=about("number of steps; fewer run if time runs out", least=1))
     share: float = field(
-        metadata=about("share of the remaining time, if there is a time limit", above=0, most=1)
+        metadata=about("share of a time limit, relative to other stages", above=0, most=1)
     )
     rays: int = setting(2048, "rays per step", least=1)
     sharpness: tuple[float, float] = setting(
@@ -70,17 +70,17 @@ class StageConfig:
         (6e-3, 3e-4), "learning rate of networks, light and per-view parameters", above=0
     )
     plate: float = setting(
-        0.003, "thin-plate smoothing of the updated sdf nodes, per step", least=0, most=0.125
+        0.003, "thin-plate smoothing of the sdf nodes that a step updates", least=0, most=0.125
     )
     spread: int = setting(4, "number of smoothing passes over the gradient of the sdf", least=0)
     diffusion: float = setting(
-        0.01, "smoothing of the updated feature nodes, per step", least=0, most=0.25
+        0.01, "smoothing of the feature nodes that a step updates", least=0, most=0.25
     )
     physical_from: float = setting(
         0.3, "share of the steps after which physically based rendering is added", least=0, most=1
     )
     patches_from: float = setting(
-        0.0, "share of the steps after which photographs are compared by patches", least=0, most=1
+        0.0, "share of the steps after which the loss `patches` is added", least=0, most=1
     )
     refit: bool = setting(False, "whether to freeze materials and fit light, radiance and shape")
     field: FieldName = setting(
@@ -98,12 +98,12 @@ class LossConfig:
     silhouette: float = setting(0.1, "difference between ray opacity and masks", least=0)
     metallic: float = setting(0.01, "penalty on the mean metallic value", least=0)
     light_smoothness: float = setting(
-        0.1, "L1 norm of the difference of local light between neighbouring voxels", least=0
+        0.1, "L1 norm of the difference in local light between neighbouring voxels", least=0
     )
-    white_light: float = setting(0.01, "relative distance of the mean light from grey", least=0)
+    white_light: float = setting(0.01, "relative difference of the mean light from grey", least=0)
     map_smoothness: float = setting(1e-3, "total variation of the log environment map", least=0)
     patches: float = setting(
-        0.4, "1 - correlation of patches between photographs, in every second step", least=0
+        0.4, "1 - correlation of patches across photographs; added in every second step", least=0
     )
 
     __post_init__ = check_settings
@@ -114,7 +114,7 @@ class EntropyConfig:
     """The prior that an object has few albedo colours, see training/albedo_entropy.py."""
 
     teaching_steps: int = setting(
-        60, "number of steps that teach the new albedos to the material head", least=1
+        60, "number of steps that train the material head to predict the new albedos", least=1
     )
 
     __post_init__ = check_settings
@@ -125,10 +125,10 @@ class JointConfig:
     """Joint optimisation of one environment map, materials and normals: training/joint_solve.py."""
 
     iterations: int = setting(675, "total number of Adam steps; fewer if time runs out", least=1)
-    share: float = setting(0.27, "share of the time limit", above=0, most=1)
-    rays: int = setting(2048, "number of observations per step; at least as many as views")
+    share: float = setting(0.27, "share of a time limit, relative to other stages", above=0, most=1)
+    rays: int = setting(2048, "number of observations per step; at least the value of views")
     views: int = setting(4, "number of observations of each point per step", least=1)
-    rounds: int = setting(4, "number of rounds: Newton steps on the map, then Adam steps", least=1)
+    rounds: int = setting(4, "rounds, each of Newton steps on the map and then Adam steps", least=1)
     points: int = setting(20400, "number of surface points", least=1)
     tracing: int = setting(2, "visibility rays per point and direction", least=1)
     colors: bool = setting(True, "whether to minimise the entropy of the albedo")
@@ -166,10 +166,10 @@ class TrainConfig:
         metadata=about("stages in order; the first is a StageConfig, which creates the grid")
     )
     minutes: float | None = setting(
-        None, "time limit, including preparation; stages are shortened equally to fit", above=0
+        None, "time limit, including preparation; stages run fewer steps if it is short", above=0
     )
     downscale: int = setting(
-        0, "train at 1/N of the photographs' size; 0: as large as the grids can use", least=0
+        0, "train at 1/N of the photographs' size; 0: longer side of about 1000 pixels", least=0
     )
     voxel_pixels: float = setting(
         1.0, "minimum width of a voxel at the object, in pixels of the photographs", least=0
@@ -177,7 +177,7 @@ class TrainConfig:
     seed: int = setting(0, "random seed; it does not change the validation pixels")
     masks: MasksFrom = setting("auto", "auto: erode masks that extend past the object's edge")
     cameras: CamerasFrom = setting(
-        "auto", "refined: optimise camera poses; auto: only if silhouettes are inconsistent"
+        "auto", "refined: optimise camera poses; auto: do so if silhouettes are inconsistent"
     )
     exposures: bool = setting(
         True, "whether to detect varying exposure and light; the result sets scene.varying"
@@ -195,7 +195,7 @@ class TrainConfig:
     )
     carving_seconds: float = setting(
         12.0,
-        "carve unless that takes longer than this on two cores; 0 or varying light: never",
+        "skip carving if it would take longer than this on two cores, or if the light varies",
         unit="seconds",
         least=0,
     )
@@ -205,9 +205,9 @@ class TrainConfig:
         unit="dB",
         least=0,
     )
-    capacity: Capacity = setting("adaptive", "adaptive: shrink the model if validation PSNR allows")
+    capacity: Capacity = setting("adaptive", "adaptive: shrink the model with little loss of PSNR")
     budget_mb: float | None = setting(
-        None, "maximum size of the model file; needs adaptive capacity", unit="1e6 bytes", above=0
+        None, "maximum size of the model file; needs capacity=adaptive", unit="1e6 bytes", above=0
     )
     scene: SceneConfig = setting(SceneConfig(), "sizes of the model, and its lighting model")
     loss: LossConfig = setting(LossConfig(), "weights of the losses in stages of type StageConfig")
@@ -221,7 +221,7 @@ class TrainConfig:
         kinds = [s.field for s in self.stages if isinstance(s, StageConfig)]
         if "hash" in kinds and set(kinds) != {"hash"}:
             raise ConfigError(
-                f"TrainConfig: all stages or none must use hash fields, got {', '.join(kinds)}"
+                f"TrainConfig: all stages or none must have a hash field, got {', '.join(kinds)}"
             )
         if kinds != sorted(kinds):
             raise ConfigError(
@@ -229,22 +229,22 @@ class TrainConfig:
             )
         if "hash" in kinds and self.scene.channels % PER_LEVEL:
             raise ConfigError(
-                f"TrainConfig: the hash field has {PER_LEVEL} channels per level: scene.channels "
-                f"must be a multiple of that, got {self.scene.channels}"
+                f"TrainConfig: scene.channels must be a multiple of {PER_LEVEL}, the number of "
+                f"channels per level of a hash field, got {self.scene.channels}"
             )
         if self.capacity == "adaptive" and "sparse" in kinds:
             raise ConfigError(
                 "TrainConfig: adaptive capacity and budget_mb do not work with sparse fields: "
-                "use another field, or leave them out",
+                "use another field, or fixed capacity without a budget",
                 "budget_mb",
             )
         if not self.scene.sky_nodes and any(isinstance(s, JointConfig) for s in self.stages):
             raise ConfigError(
-                "TrainConfig: a JointConfig stage needs scene.sky_nodes above 0, but it is 0"
+                "TrainConfig: a stage of type JointConfig needs scene.sky_nodes above 0, got 0"
             )
         if self.budget_mb is not None and self.capacity == "fixed":
             raise ConfigError(
-                f"TrainConfig: budget_mb {self.budget_mb:g} needs adaptive capacity, got fixed"
+                f"TrainConfig: budget_mb={self.budget_mb:g} needs capacity=adaptive, got fixed"
             )
 
 

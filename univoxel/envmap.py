@@ -37,7 +37,7 @@ class EnvMap:
         shape = list(r.shape)
         if r.dim() != 3 or shape[0] < 1 or shape[1] != 2 * shape[0] or shape[2] != 3:
             raise ValueError(
-                f"environment map: expected [H, W, 3], twice as wide as high (W = 2 H), got {shape}"
+                f"environment map: expected an array [H, W, 3] with W = 2 H, got {shape}"
             )
         if r.dtype != torch.float32:
             raise ValueError(f"environment map: expected float32 radiance, got {r.dtype}")

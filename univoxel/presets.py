@@ -131,7 +131,7 @@ def with_metal(cfg: TrainConfig, metal: Metal) -> TrainConfig:
     if not any(isinstance(s, JointConfig) for s in cfg.stages):
         raise UserError(
             f"metal={metal} needs light=hybrid, the only model that classifies metals, got "
-            f"{cfg.scene.light.kind}",
+            f"light={cfg.scene.light.kind}",
             *("metal", "light"),
         )
     only = metal == "all"

@@ -85,7 +85,7 @@ def load_world(run: Path) -> np.ndarray | None:
     except (KeyError, TypeError, ValueError, OverflowError):
         moved = np.empty(0)
     if moved.shape != (3, 4) or not np.isfinite(moved).all():
-        raise DataError(f"{path}: expected from_data with a rotation and a translation")
+        raise DataError(f"{path}: expected from_data, a 3x4 matrix of rotation and translation")
     return moved
 
 
@@ -93,7 +93,7 @@ def _source_of(run: Path) -> Source:
     """What photographs a run's config.json says that it was trained on."""
     path = run / "config.json"
     if not path.is_file():
-        raise DataError(f"{run}: expected the folder of a run, but it has no {path.name}")
+        raise DataError(f"{run}: expected the folder of a run, but {path.name} is missing")
     config = read_json(path)
     if not isinstance(config, dict):
         raise DataError(f"{path}: expected a JSON object of settings, got {config!r:.80}")
@@ -196,7 +196,7 @@ def judge(evidence: Evidence) -> Verdict:
         evidence.outline,
         GOOD_OUTLINE,
         POOR_OUTLINE,
-        "{:.0%} of the outline differs from the masks",
+        "{:.0%} of the validation pixels contradict the masks",
         "correct the masks",
     )
     check(

@@ -41,7 +41,7 @@ class SceneConfig:
 
     channels: int = setting(16, "number of features per voxel", least=1)
     material_channels: int = setting(
-        8, "number of features from which albedo and roughness are decoded", least=1
+        8, "number of features from which the material head decodes the material", least=1
     )
     hidden: int = setting(64, "width of the material and radiance heads", least=1)
     mirror_levels: int = setting(5, "levels of the table of reflected directions", least=0, most=8)
@@ -67,17 +67,15 @@ class SceneConfig:
     )
     flash: float | None = setting(
         None,
-        "distance between the object and a flash at the camera lens, see Flash; None: no flash",
+        "distance between the object and a flash on the camera; None: there is no flash",
         unit="world units",
         above=0,
     )
-    varying: Varying = setting("none", "what changes between photographs, see ViewLights")
-    codes: int = setting(8, "size of a view's appearance embedding", least=1)
-    refined: bool = setting(
-        False, "whether camera poses are optimised, see PoseSteps; set by training"
-    )
+    varying: Varying = setting("none", "what varies between photographs; light includes exposure")
+    codes: int = setting(8, "size of the appearance embedding of each view", least=1)
+    refined: bool = setting(False, "whether camera poses are optimised; training sets this")
     views: tuple[str, ...] = setting(
-        (), "names of the photographs, if anything is learned for each one; set by training"
+        (), "names of the photographs if each has its own parameters; training sets this"
     )
 
     def __post_init__(self) -> None:
@@ -86,23 +84,23 @@ class SceneConfig:
         check_fields(self, most, lambda x: x <= self.channels, "material_channels")
         if self.turntable is not None and not isinstance(self.light, lights.LocalLightConfig):
             raise ConfigError(
-                "SceneConfig: light that rotates with the camera needs hybrid or a local lighting "
-                f"model (sg, sh or mlp), got {self.light.kind}",
+                "SceneConfig: light_frame=turntable, in which the light rotates with the camera, "
+                f"needs light=hybrid, sg, sh or mlp, got {self.light.kind}",
                 "light_frame",
                 "light",
             )
         if self.turntable is not None and self.varying == "light":
             raise ConfigError(
-                "SceneConfig: light that rotates with the camera (a turntable) cannot also differ "
-                "between photographs, got varying=light; varying=exposure is possible",
+                "SceneConfig: light that rotates with the camera (light_frame=turntable) cannot "
+                "also differ between photographs (varying=light): use varying=exposure or none",
                 "light_frame",
                 "varying",
             )
         if self.varying == "light" and not isinstance(self.light, lights.LocalLightConfig):
             raise ConfigError(
-                "SceneConfig: varying=light needs hybrid or a local lighting model (sg, sh or "
-                f"mlp), got {self.light.kind}; varying=exposure works with all lighting models",
-                "varying",
+                "SceneConfig: varying=light needs light=hybrid, sg, sh or mlp, got "
+                f"{self.light.kind}; varying=exposure works with all lighting models",
+                *("varying", "light"),
             )
 
 
@@ -178,8 +176,8 @@ class Scene(nn.Module):
             self.views.choose(view)
         elif view is not None:
             raise UserError(
-                f"light_of: expected a run trained with varying light, got {view!r} for a run in "
-                "which all views share one light",
+                f"light_of={view}: all views of this run share one light; to learn a light for "
+                "each view, train with varying=light",
                 "light_of",
                 "varying",
             )
@@ -380,8 +378,8 @@ class Description:
     def __post_init__(self) -> None:
         check_fields(self, "above 0", lambda x: 0 < x < math.inf, "inv_s")
         if (self.field == "hash") != (self.levels is not None):
-            asked = "without" if self.levels else "with"
-            raise ConfigError(f"Description: expected a {self.field} field {asked} levels")
+            asked = "must be left out" if self.levels else "are required"
+            raise ConfigError(f"Description: levels {asked} for a {self.field} field")
 
 
 def load_checkpoint(run: str | Path) -> tuple[Scene, dict[str, Any]]:
@@ -412,7 +410,7 @@ def load_checkpoint(run: str | Path) -> tuple[Scene, dict[str, Any]]:
         scene.load_state_dict(tensors)
         return scene.eval(), state
     except (RuntimeError, KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        raise DataError(f"{path}: the tensors do not match their description: {error}") from error
+        raise DataError(f"{path}: the tensors do not match the header: {error}") from error
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -426,8 +424,8 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     if not isinstance(meta, dict) or meta.get("format") != FORMAT:
         came = meta.get("format") if isinstance(meta, dict) else meta
         raise DataError(
-            f"{path}: expected checkpoint format {FORMAT}, got {came!r:.60}; another version of "
-            "univoxel wrote it"
+            f"{path}: expected checkpoint format {FORMAT}, got {came!r:.60}: open it with the "
+            "version of univoxel that wrote it, or train again"
         )
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not tensor.isfinite().all():
@@ -459,7 +457,7 @@ def _scene(about: Description, bricks: Bricks | None) -> Scene:
     field = Field(distances, encoding)
     if field.channels != about.scene.channels:
         raise ValueError(
-            f"the field has {field.channels} channels, the networks use {about.scene.channels}"
+            f"the field has {field.channels} channels, but the networks use {about.scene.channels}"
         )
     return Scene(about.scene, field, about.inv_s)
 
@@ -491,13 +489,13 @@ def _compare_rows(name: str, table: Tensor, rows: Tensor, values: Tensor) -> Non
     count = table.numel() // math.prod(channels)
     if rows.dtype != torch.int32 or list(values.shape) != [*rows.shape, *channels]:
         raise ValueError(
-            f"expected int32 rows of {name} with {channels} values each, got rows "
+            f"expected int32 row numbers of {name} and {channels} values for each, got row numbers "
             f"{list(rows.shape)} {rows.dtype} and values {list(values.shape)}"
         )
     if count > ROWS_FOR_ONE * (len(rows) + ROWS_FOR_ONE):
-        raise ValueError(f"expected {name} with {count} rows, got at most {len(rows)}")
+        raise ValueError(f"{name} has {count} rows, but the file stores only {len(rows)}")
     if len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < count:
-        raise ValueError(f"expected {name} with rows in [0, {count}), got others")
+        raise ValueError(f"row numbers of {name} must be in [0, {count}), but some are not")
 
 
 def _unpack_(scene: Scene, tensors: dict[str, Tensor]) -> None:

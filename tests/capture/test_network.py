@@ -131,7 +131,7 @@ def test_rembg_goes_first(home, monkeypatch, caplog):
     monkeypatch.setitem(sys.modules, "rembg", made)
     mask = module.mask_network()(photograph())
     torch.testing.assert_close(mask, photograph()[..., 0].float() / 255)
-    assert caplog.messages == ["u2netp: downloading the weights once, 4.7 MB"]
+    assert caplog.messages == ["u2netp: downloading the weights (4.7 MB, only once)"]
     (home / "u2net.onnx").touch()
     assert not module.mask_network("u2net")(photograph()).any()
     assert len(caplog.messages) == 1

@@ -130,12 +130,12 @@ def test_reasons_of_photographs_without_a_place():
     pairs = [(2, 3, 12, 2), (3, 4, 80, 2)]
     assert why_not(None, features, pairs, {}) == "no features that can be matched"
     assert why_not(1, features, pairs, {}) == "no features that can be matched"
-    assert (
-        why_not(2, features, pairs, {}) == "at most 12 matches with one photograph; 15 are needed"
+    assert why_not(2, features, pairs, {}) == (
+        "at most 12 matches with any other photograph, but 15 are needed"
     )
     assert why_not(3, features, pairs, {3: 4}).startswith("connected to 4 photographs")
     assert why_not(4, features, pairs, {}) == (
-        "80 matches with one photograph, but these contradict the other matches"
+        "80 matches with another photograph, but these contradict the other matches"
     )
 
 

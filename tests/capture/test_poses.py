@@ -367,7 +367,7 @@ def test_a_step_that_fails_or_hangs_is_stopped(tmp_path, monkeypatch):
         list(sfm.run(sfm.Request("match", "/", "/", "/"), log, lambda: 0))
     path = pycolmap_that("import time; time.sleep(60)", tmp_path)
     monkeypatch.setenv("PYTHONPATH", path)
-    with pytest.raises(ProcessFailed, match="took over 0 s and was stopped"):
+    with pytest.raises(ProcessFailed, match="pycolmap was stopped after 0 s"):
         list(sfm.run(request, log, lambda: 0))
 
 

@@ -153,7 +153,7 @@ def test_what_is_done_is_not_done_again(night, scenes, monkeypatch, capsys):
 def test_another_training_is_refused(night, scenes, capsys):
     out, options = night
     assert main(["batch", str(scenes[0]), "--out", str(out), *options, "--set=seed=4"]) == 2
-    assert re.search(r"ball\.json differs in changes from .*--out", capsys.readouterr().err)
+    assert re.search(r"ball\.json has other values of changes .*--out", capsys.readouterr().err)
 
 
 def test_a_scene_that_fails_takes_no_other_with_it(scenes, tmp_path, monkeypatch, capsys):

@@ -287,7 +287,7 @@ def test_masks_come_from_a_network_or_else_from_depth(
     with caplog.at_level("INFO"):
         task.capture(pictures, tmp_path / "mug")
     assert steps[1] == ("cutout", tmp_path / "mug/scene", "rembg" if there else "none")
-    assert ("masks are made from depth only" in caplog.text) != there
+    assert ("masks are made from depth maps" in caplog.text) != there
 
 
 def test_masks_of_ones_own_go_on(steps, pictures, tmp_path):
@@ -337,7 +337,7 @@ def test_another_box_makes_other_masks(steps, pictures, tmp_path, monkeypatch):
     with pytest.raises(ExistingFile, match=said):
         task.find_data(pictures, out, masks="none", box=box)
     scene = task.SCENE
-    with pytest.raises(UserError, match="already has masks, so box would have no effect"):
+    with pytest.raises(UserError, match="already has masks, so a box would have no effect"):
         task.find_data(scene, tmp_path / "other", box=box)
 
 
@@ -518,6 +518,6 @@ def test_how_long_training_takes_is_said_before_cameras_are_found(
     with pytest.raises(DataError, match="no cameras"):
         task.capture(photographs[0], tmp_path / "out", masks=photographs[1], preset="draft")
     assert re.search(
-        r"training takes about \d+ (s|min) on this machine, once cameras are found",
+        r"training takes about \d+ (s|min) on this machine, after cameras are found",
         caplog.text,
     )

@@ -73,7 +73,7 @@ def test_what_is_written_can_be_trained_on(tmp_path, caplog, by_brightness):
         torch.testing.assert_close(cut.cameras.camera_to_world, source.cameras.camera_to_world)
         for view in range(count):  # each mask with its photograph
             assert iou(cut.picture(view)[1], photograph(source.cameras, view)[1]) > 0.9
-    with pytest.raises(FileExistsError, match="cut exists already: choose another folder for out"):
+    with pytest.raises(FileExistsError, match="cut already exists: choose another folder for out"):
         task.cutout(data, out)
 
 

@@ -288,7 +288,7 @@ def broken_relit(folders):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda f: (f.run / "config.json").unlink(), r"folder of a run, but it has no"),
+        (lambda f: (f.run / "config.json").unlink(), r"folder of a run, but config"),
         (
             lambda f: (f.run / "config.json").write_text("{}"),
             "config.json: expected data to be a folder",
@@ -347,7 +347,7 @@ def test_large_panels_shrink():
 def test_sheet_needs_rows_of_one_kind():
     panel = Panel("albedo", torch.zeros(4, 4, 3), None, None, 0.2)
     for rows in ([], [("a", [])], [("a", [panel]), ("b", [panel, panel])]):
-        with pytest.raises(ValueError, match="rows of the same quantities"):
+        with pytest.raises(ValueError, match="rows with the same panels"):
             contact_sheet(rows)
 
 

@@ -111,10 +111,10 @@ def test_pixels_as_they_are_written():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("r_7", (1, 1)), "view: expected a number below 2 or a name from r_0 to r_1, got 'r_7'"),
-        (("2", (1, 1)), "view: expected a number below 2"),
-        (("0", (32, 1)), "pixel: expected a pixel inside 32x32, got 32,1"),
-        (("0", (-1, 1)), "pixel: expected a pixel inside 32x32, got -1,1"),
+        (("r_7", (1, 1)), r"view \(below 2\) or its name \(from r_0 to r_1\), got 'r_7'"),
+        (("2", (1, 1)), r"view: expected the number of a view \(below 2\)"),
+        (("0", (32, 1)), "pixel: expected a pixel of a 32x32 image, got 32,1"),
+        (("0", (-1, 1)), "pixel: expected a pixel of a 32x32 image, got -1,1"),
         (("0", (0, 0)), "pixel: there is no surface under 0,0"),
         (("0", (16, 16), "a.jpg"), r"out: expected a name that ends in \.png, got a\.jpg"),
         (("0", (16, 16), None, 0), "height must be at least 1, got 0"),

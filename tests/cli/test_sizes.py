@@ -178,7 +178,7 @@ def test_a_pixel_is_one_of_its_view(runs, data):
     view = 1
     width, height = views.cameras.size(view)
     assert width < views.cameras.width or height < views.cameras.height
-    with pytest.raises(UserError, match=f"expected a pixel inside {width}x{height}"):
+    with pytest.raises(UserError, match=f"expected a pixel of a {width}x{height}"):
         inspect(runs[0], str(view), (width, height - 1))
     assert inspect(runs[0], str(view), (width // 2, height // 2), height=8).is_file()
 

@@ -334,7 +334,7 @@ def test_a_limit_may_be_enough_for_the_steps_alone(caplog):
     cameras = SimpleNamespace(width=4000, height=3000)
     photos = type("", (), {"cameras": cameras, "downscale": 1, "__len__": lambda self: 60})()
     task.announce(progress, photos)
-    assert caplog.messages[-1].endswith("for all steps if preparation takes at most 30 s")
+    assert caplog.messages[-1].endswith("all steps, if preparation takes at most 30 s")
     assert clock.preparation == 30.0
 
 

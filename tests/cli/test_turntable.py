@@ -137,7 +137,7 @@ def test_what_decides(photographs, monkeypatch, caplog, still_around, ahead, sav
     assert (found.turntable is not None) == turns
     assert found.flash is None
     if turns:
-        assert "a fixed light: 0 %" in caplog.text
+        assert "(fixed light: 0 %)" in caplog.text
 
 
 def test_what_is_known_is_not_looked_for(photographs):
@@ -271,7 +271,7 @@ def test_a_checkpoint_keeps_the_axes(laid, tmp_path):
     [
         (
             {"light": EnvmapConfig()},
-            r"needs hybrid or a local .* model \(sg, sh or mlp\), got envmap",
+            "needs light=hybrid, sg, sh or mlp, got envmap",
         ),
         ({"varying": "light"}, "cannot also differ"),
     ],

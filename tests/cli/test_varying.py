@@ -247,6 +247,7 @@ def test_the_light_of_a_view_from_the_command_line(tmp_path, capsys):
     for command in (["eval"], ["inspect", *place], ["envmap", "--out", str(tmp_path / "a.exr")]):
         capsys.readouterr()
         assert main([command[0], str(run), *command[1:], "--light-of", "r_9"]) == 2
-        assert "--light-of: expected a number below 6 or a name from r_0 to r_5, got 'r_9'" in (
-            capsys.readouterr().err
+        assert (
+            "--light-of: expected the number of a view (below 6) or its name (from r_0 to r_5)"
+            in (capsys.readouterr().err)
         )

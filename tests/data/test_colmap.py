@@ -100,7 +100,7 @@ TEXT = {
     ),
     "camera": (
         edited("images.txt", lambda t: t.replace(" 3 p_004", " 9 p_004")),
-        r"images\.txt: camera 9 of p_004\.png does not exist",
+        r"images\.txt: p_004\.png refers to missing camera 9",
     ),
     "line": (
         edited("images.txt", lambda t: t.replace(" 3 p_004.png", "")),
@@ -119,8 +119,8 @@ TEXT = {
         lambda f: (f / "images").rename(f / "photos"),
         r"images\.txt: missing images: p_009\.png, .* \(10 of 10\).*looked in .*images and ",
     ),
-    "size": (other_size(1, 0), r"p_004\.png: expected 12x8 pixels, as its camera .*, got 13x8"),
-    "height": (other_size(0, 1), r"p_004\.png: expected 12x8 pixels, as its camera .*, got 12x9"),
+    "size": (other_size(1, 0), r"p_004\.png: expected 12x8 pixels, the size of .*, got 13x8"),
+    "height": (other_size(0, 1), r"p_004\.png: expected 12x8 pixels, the size of .*, got 12x9"),
 }
 BINARY = {
     "cut cameras": (cut("cameras.bin", 30), r"cameras\.bin: this file of a COLMAP model"),

@@ -181,7 +181,7 @@ def test_lists_are_read_as_they_were_meant(tmp_path, writer, name, change):
         assert torch.equal(alpha, wanted[color][0])
         torch.testing.assert_close(camera, wanted[color][1:], atol=1e-5, rtol=1e-5)
     about = load_photos(data).about
-    assert ("10 cameras scaled to smaller images" in about) == (name == "smaller")
+    assert ("10 cameras scaled to match smaller images" in about) == (name == "smaller")
 
 
 def test_pictures_of_one_name_in_two_folders(tmp_path):
@@ -283,7 +283,7 @@ def two_fit(folder):
         (
             write_nerfstudio,
             text("transforms.json", ('"k1": 0.0', '"k5": 0.1')),
-            "expected only distortion by k1 k2 k3 p1 p2, got k5",
+            "expected only distortion terms k1 k2 k3 p1 p2, got k5",
         ),
         (
             lambda f, s: write_colmap(

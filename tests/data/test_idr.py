@@ -79,7 +79,7 @@ def test_pictures_that_are_not_there(tmp_path):
         (tmp_path / place / "004.png").unlink()
     photos = load_photos(tmp_path)
     assert photos.names == ["001", "002", "003", "005", "006", "007", "008"]
-    assert "1 of 10 listed images are missing and left out" in photos.about
+    assert "1 of 10 listed images were left out" in photos.about
     wanted = written.poses[[1, 2, 3, 5, 6, 7, 8], :3, 3]
     np.testing.assert_allclose(photos.cameras.camera_to_world[:, :, 3], wanted, atol=1e-5)
 
@@ -108,7 +108,7 @@ def leaning(arrays):
             "cameras_sphere.npz: this npz file could not be read",
         ),
         (edited(dict.clear), "cameras_sphere.npz: expected arrays world_mat_0, .* got none"),
-        (edited(lambda a: a.update(world_mat_2=np.eye(3))), r"npz: expected world_mat_2 \[4, 4\]"),
+        (edited(lambda a: a.update(world_mat_2=np.eye(3))), "npz: expected a 4x4 matrix"),
         (
             edited(lambda a: a.update(world_mat_2=np.full((4, 4), "a"))),
             "npz: expected arrays of numbers, but world_mat_2 is of type <U1",
@@ -119,14 +119,14 @@ def leaning(arrays):
         ),
         (
             edited(lambda a: a.update(world_mat_2=np.ones((4, 4)))),
-            "world_mat_2: expected a projection matrix, got a singular one",
+            "world_mat_2: expected an invertible projection matrix, got a singular one",
         ),
-        (edited(leaning), "world_mat_3: .* a skew of 1 pixels"),
+        (edited(leaning), "world_mat_3: .* rows shifted by up to 1 pixels"),
         (
             edited(lambda a: a.update(world_mat_2=np.diag([50.0, 1, 1, 1]) @ a["world_mat_2"])),
             "world_mat_2: expected cx between -12 and 24, got 300",
         ),
-        (edited(lambda a: a.pop("world_mat_9")), "expected a world_mat for each of 10"),
+        (edited(lambda a: a.pop("world_mat_9")), "expected a matrix world_mat for each of 10"),
         (lambda f: (f / "image").rename(f / "photos"), "npz: expected images in .*image, f"),
         (
             lambda f: write_png(f / "mask" / "p_003.png", np.ones((4, 4), np.uint8)),

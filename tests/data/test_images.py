@@ -162,7 +162,7 @@ def test_other_kinds_under_the_name_of_jpeg(tmp_path):
         with pytest.raises(DataError, match=r"a\.jpg: .*but the file is HEIC or AVIF: convert"):
             read(path)
     Image.fromarray(np.zeros((3, 5), np.float32)).save(tmp_path / "a.tif")
-    with pytest.raises(DataError, match="expected an image with 8 or 16 bits, got 32 bits"):
+    with pytest.raises(DataError, match="expected 8 or 16 bits per channel, got 32"):
         images.read_image(tmp_path / "a.tif")
     (tmp_path / "a.tif").write_bytes(b"II*\0" + bytes(40))
     with pytest.raises(DataError, match=r"this TIFF could not be read: .*: convert it to"):

@@ -171,7 +171,9 @@ def test_cameras_on_their_side_do_not_say_what_is_up(tmp_path):
     turn[:2, :2] = [[0, -1], [1, 0]]
     lying = written.poses @ turn
     photos = load_photos(write_colmap(tmp_path, type(written)(lying, written.pictures)))
-    assert photos.about.endswith("world not rotated, because cameras do not show which way is up")
+    assert photos.about.endswith(
+        "world not rotated, because the cameras do not show which way is up"
+    )
     wanted = torch.from_numpy(lying[written.split("train"), :3, 3]).float()
     torch.testing.assert_close(photos.cameras.camera_to_world[:, :, 3], wanted)
 
@@ -182,7 +184,7 @@ def test_splits_that_cannot_be_made(tmp_path, writer):
     with pytest.raises(DataError, match="one: expected at least two photographs, found 1"):
         load_photos(tmp_path / "one")
     writer(tmp_path / "two", scene(views=2))
-    with pytest.raises(DataError, match="two: expected split train or test, got val"):
+    with pytest.raises(DataError, match="two: expected train or test as the split, got val"):
         load_photos(tmp_path / "two", "val")
     assert load_photos(tmp_path / "two", "test").names == ["p_000"]
 

@@ -286,8 +286,8 @@ def test_soft_masks_stay_as_they_are(tmp_path):
     ("picture", "message"),
     [
         (Image.fromarray(np.array([[0, 1, 2]], np.uint8)), "values of at most 2 of 255"),
-        (palette([[0, 1, 2]], (0, 0, 0), (128, 0, 0), (0, 128, 0)), "3 colours of a palette"),
-        (palette([[0, 1, 1]], (9, 9, 200), (128, 0, 0)), "2 colours of a palette"),
+        (palette([[0, 1, 2]], (0, 0, 0), (128, 0, 0), (0, 128, 0)), "3 palette colours"),
+        (palette([[0, 1, 1]], (9, 9, 200), (128, 0, 0)), "2 palette colours"),
         (
             Image.fromarray(np.random.default_rng(0).integers(0, 255, (9, 9, 3), np.uint8)),
             "got an image with several colours",

@@ -38,8 +38,8 @@ def test_what_is_written_is_read(tmp_path):
         (lambda data: data.replace(b"element face", b"element edge"), "expected vertices x y z"),
         (lambda data: data.replace(b"vertex 4", b"vertex -1"), "could not read them: -1 of vertex"),
         (lambda data: data.replace(b"face 2", b"face 9" + 30 * b"9"), "expected vertices x y z"),
-        (lambda data: data[:-12] + b"\x63" + data[-11:], "triangles that index the 4 vertices"),
-        (lambda data: data[:-13] + b"\4" + data[-12:], "triangles that index the 4 vertices"),
+        (lambda data: data[:-12] + b"\x63" + data[-11:], "triangles with vertex indices below 4"),
+        (lambda data: data[:-13] + b"\4" + data[-12:], "triangles with vertex indices below 4"),
     ],
 )
 def test_other_files_are_refused(tmp_path, change, message):

@@ -25,7 +25,7 @@ def test_pictures_that_are_not_there_are_left_out(tmp_path, writer, caplog):
     with caplog.at_level(logging.WARNING, "univoxel"):
         photos = load_photos(data)
     listed = 8 if writer is write_nerf else 10  # which has a file for each split
-    assert f"3 of {listed} listed images are missing and left out" in photos.about
+    assert f"3 of {listed} listed images were left out" in photos.about
     assert all(f"p_00{v}" in caplog.messages[0] for v in lost)
     assert caplog.messages[0].endswith(f"(3 of {listed} left out)")
     if writer is write_nerf:
@@ -64,7 +64,7 @@ def test_splits_that_name_what_is_not_there(tmp_path):
     (data / "images" / "p_002.png").unlink()
     assert load_photos(data).names == ["p_001"]
     (data / "images" / "p_003.png").unlink()
-    with pytest.raises(DataError, match="frames in test_filenames, found none of 1"):
+    with pytest.raises(DataError, match="frames in test_filenames, found 0 of 1"):
         load_photos(data, "test")
 
 
@@ -89,4 +89,4 @@ def test_a_dot_in_a_name_is_no_ending(tmp_path):
         root["frames"][k]["file_path"] = f"images/p_0.{k}"
     (data / "images" / "p_0.png").write_bytes((data / "images" / "p_001.png").read_bytes())
     (data / "transforms.json").write_text(json.dumps(root))
-    assert "2 of 10 listed images are missing" in load_photos(data).about
+    assert "2 of 10 listed images were left out" in load_photos(data).about

@@ -133,7 +133,7 @@ def test_splits_of_the_colmap_layout(tmp_path):
         write_exr(tmp_path / "images" / f"p_00{v}.exr", planes)
     assert load_photos(tmp_path).names == ["p_000", "p_002", "p_003"]
     assert load_photos(tmp_path, "test").names == ["p_001"]
-    with pytest.raises(DataError, match="expected split train or test, got val"):
+    with pytest.raises(DataError, match="expected train or test as the split, got val"):
         load_photos(tmp_path, "val")
     (tmp_path / "test_id.txt").write_text("nothing.png\n")
     with pytest.raises(DataError, match=r"test_id\.txt: missing images: nothing\.png \(1 of 1\)"):

@@ -40,7 +40,7 @@ def test_cameras_of_larger_pictures(tmp_path):
         (edited(cy=None), "p_003.json: expected cy between -inf and inf, got nothing"),
         (edited(width="12"), "p_003.json: expected width between 0 and inf, got '12'"),
         (edited(t_12=None), "p_003.json: expected t_12 between -inf and inf, got nothing"),
-        (edited(t_00=9.0), "p_003.json: expected a rigid transform_matrix"),
+        (edited(t_00=9.0), "p_003.json: expected rotation and translation"),
         (edited(width=10), "p_003.png: expected the aspect ratio 10x8 of .*, got 12x8"),
         (
             lambda f: (f / "keyframes" / "corrected_cameras" / "p_003.json").write_text("[]"),

@@ -47,7 +47,7 @@ def test_pictures_that_are_not_there_and_names_with_folders(tmp_path):
     edited(("p_002.png", r"D:\shots\p_002.tif"))(tmp_path)
     photos = load_photos(tmp_path)
     assert photos.names[0] == "p_002"
-    assert "1 of 10 listed images are missing" in photos.about
+    assert "1 of 10 listed images were left out" in photos.about
 
 
 def value(index, new):
@@ -70,12 +70,12 @@ def only_a_head(folder):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (value(4, "north"), "line 5: expected a number as heading, got 'north'"),
-        (value(1, ""), "line 5: expected a number as x, got ''"),
-        (value(3, "nan"), "line 5: expected a number as alt, got 'nan'"),
+        (value(4, "north"), "line 5: expected a number for heading, got 'north'"),
+        (value(1, ""), "line 5: expected a number for x, got ''"),
+        (value(3, "nan"), "line 5: expected a number for alt, got 'nan'"),
         (value(7, "0"), "line 5: expected fl_x between 0 and inf, got 0.0"),
         (value(8, "3"), "line 5: expected cx between -12 and 24, got 42.0"),
-        (value(12, "far"), "line 5: expected a number as k3, got 'far'"),
+        (value(12, "far"), "line 5: expected a number for k3, got 'far'"),
         (value(10, "0,0"), "line 5: expected 16 values, got 17"),
         (only_a_head, "cameras.csv: expected a line for each camera, got none"),
         (

@@ -75,5 +75,5 @@ def test_broken_scenes(data, change, message):
 
 
 def test_a_split_that_is_not_there(data):
-    with pytest.raises(DataError, match=r"expected val_000/metadata\.json and so on, got none"):
+    with pytest.raises(DataError, match=r"expected val_000/metadata\.json and so on, found none"):
         load_photos(data, "val")

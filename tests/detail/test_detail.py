@@ -245,7 +245,7 @@ def test_files_of_another_checkpoint_are_refused(tiny_copy, detail, capsys):
     save_scene(scene, run, state)
     capsys.readouterr()
     assert main(["export", str(run), "--mesh", str(mesh)]) == 2
-    assert "another checkpoint than" in capsys.readouterr().err
+    assert "another version of scene.safetensors" in capsys.readouterr().err
 
 
 def test_a_limit_of_time_leaves_room(photos, scene, tmp_path, caplog):

@@ -96,7 +96,7 @@ def test_every_nth_of_all_names():
 @pytest.mark.parametrize(
     ("every", "message"),
     [
-        (1, r"test_every 1 selects 2 training photographs, such as b"),
+        (1, r"test_every 1 selects 2 photographs that were used for training, such as b"),
         (0, "test_every must be at least 1, got 0"),
     ],
 )

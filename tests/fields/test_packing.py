@@ -34,7 +34,7 @@ def test_a_jump_between_the_sides_is_kept():
 
 def test_another_grid_is_refused():
     packed = pack(two_balls(), 2.0)
-    with pytest.raises(ValueError, match="expected the sides of"):
+    with pytest.raises(ValueError, match="expected signs for"):
         unpack(packed | {"side": packed["side"][:1]}, (24, 24, 24), 4.0)
     with pytest.raises(IndexError):
         unpack(packed, (8, 8, 8), 4.0)

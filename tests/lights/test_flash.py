@@ -160,7 +160,7 @@ def test_photographs_tell_of_a_flash(photographs, caplog):
     told = light_frame_of(photos, *hull_of(photos), "auto")
     assert told.turntable is None
     assert told.flash == pytest.approx(2.0, abs=0.3)
-    assert "light: there is a flash at the camera" in caplog.text
+    assert "light: there is a flash on the camera" in caplog.text
     photos = photographs["room"]
     assert light_frame_of(photos, *hull_of(photos), "camera").flash is not None
     assert light_frame_of(photographs["flash"], *hull_of(photos), "world") == LightFrame()

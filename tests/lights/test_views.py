@@ -58,7 +58,7 @@ def test_the_light_of_a_view_is_shown(view, index):
 
 @pytest.mark.parametrize("view", ["3", "below", "-1"])
 def test_no_such_view(view):
-    wanted = f"light_of: expected a number below 3 or a name from left to above, got '{view}'"
+    wanted = rf"number of a view \(below 3\) or its name \(from left to above\), got '{view}'"
     with pytest.raises(ValueError, match=wanted):
         shaken().choose(view)
 
@@ -131,5 +131,5 @@ def test_one_light_for_all_has_no_views():
     assert scene.views is None
     features = torch.zeros(2, 4)
     assert scene.coded(features) is features
-    with pytest.raises(ValueError, match="light_of: expected a run trained with varying light"):
+    with pytest.raises(ValueError, match="all views of this run share one light"):
         scene.show_light_of("left")

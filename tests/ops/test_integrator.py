@@ -156,5 +156,5 @@ def test_no_points_and_strided_points():
 
 def test_there_is_no_reference():
     mesh, scene = octahedron()
-    with use_backend("reference"), pytest.raises(RuntimeError, match="native backend only"):
+    with use_backend("reference"), pytest.raises(RuntimeError, match="needs the native backend"):
         shade(mesh, scene, WHITE, *sphere_points(2))

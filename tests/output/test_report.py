@@ -106,7 +106,7 @@ def test_it_asks_for_the_sector_that_was_not_photographed(run, text):
     assert said.count('class="taken"') == len(advice.taken)
     assert said.count('class="gap"') == int(advice.gap.sum()) > 0
     assert "No photograph from the " in said
-    assert f"The front is where {advice.front_name} was taken" in said
+    assert f"The front is the side from which {advice.front_name} was taken" in said
 
 
 def test_photographs_stand_beside_their_render_the_worst_first(run, text):

@@ -215,7 +215,7 @@ def test_a_training_that_is_stopped_hurries_through_what_is_left(tmp_path, clock
             spent = clock.now - begin - 16
             assert spent == pytest.approx((0.17 + 0.415 * k) * left, abs=3)
     assert progress.clock.over
-    told = "the training was stopped early (completed steps: 3% of coarse shape"
+    told = "training was stopped early (completed steps: 3% of coarse shape"
     assert progress.clock.cut().startswith(told)
     assert progress.state()["finished"]
     assert Progress(cfg, clock.now, progress.state()).clock.finished
@@ -267,7 +267,7 @@ def test_a_stage_that_is_shortened_runs_through_its_schedule(tmp_path, clock, ca
     assert done[-1] > 0.99
     assert (progress.clock.early, progress.state()["early"]) == ([0], [0])
     assert progress.clock.pace == 1.0
-    assert "time limit ended" not in caplog.text
+    assert "ended at the time limit" not in caplog.text
 
 
 def test_without_a_limit_every_step_is_made(tmp_path, clock):

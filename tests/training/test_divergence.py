@@ -129,7 +129,7 @@ def test_a_collapse_goes_back(data, tmp_path, monkeypatch):
     out = task.train(small(data, tmp_path / "run"))
     (told,) = events(out)
     assert "validation PSNR is" in told
-    assert "dB at best; returned to the last good state" in told
+    assert "dB); returned to the last good state" in told
     # One step, of half the length, lies between what came back and the next look
     assert (states[10] - states[8]).abs().max() < 0.5 * (states[8] - states[0]).abs().max()
     lines = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]

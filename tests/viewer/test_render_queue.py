@@ -148,7 +148,7 @@ def test_a_chore_that_fails_is_one_line(studio, subject, light, caplog):
     watcher.wait(lambda: watcher.lines)
     studio.do(watcher.viewer, "a", failing(KeyError("a fault")))
     watcher.wait(lambda: len(watcher.lines) == 2)
-    assert watcher.lines == ["no room", "rendering failed: see univoxel's terminal"]
+    assert watcher.lines == ["no room", "rendering failed: see the terminal of univoxel"]
     assert "a fault" in caplog.text
     studio.ask(watcher.viewer, cameras, Look(light, "albedo"))  # the studio goes on
     watcher.wait(lambda: watcher.sizes)

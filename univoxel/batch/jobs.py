@@ -84,7 +84,7 @@ class Job:
         path = self.file(".json")
         found = read_json(path) if path.exists() else {}
         if not isinstance(found, dict) or any(type(found.get(k, {})) is not dict for k in RECORD):
-            raise DataError(f"{path}: this is not the record of a job: remove the file")
+            raise DataError(f"{path}: expected the record of a batch job: remove this file")
         return {key: found.get(key, {}) for key in RECORD}
 
     def save(self, record: dict[str, dict[str, Any]]) -> None:
@@ -96,11 +96,9 @@ class Job:
         before = self.record()["identity"]
         other = [key for key, value in self.identity.items() if before and before.get(key) != value]
         if other:
-            where = f"{self.name}: {self.file('.json')} differs in {' and '.join(other)}"
-            hint = (
-                "choose another folder for out, or remove that file and the results of this scene"
-            )
-            raise ExistingFile(f"{where} from this call: {hint}", "out")
+            where = f"{self.name}: {self.file('.json')} has other values of {' and '.join(other)}"
+            hint = "choose another folder for out, or remove that file and the scene's results"
+            raise ExistingFile(f"{where} than this call: {hint}", "out")
 
 
 @dataclass(frozen=True)

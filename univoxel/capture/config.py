@@ -17,19 +17,19 @@ class CaptureConfig:
     """
 
     size: int = setting(
-        FEATURE_SIZE, "longer side of images in which to find features", unit="pixels", least=64
+        FEATURE_SIZE, "longer side of the images for feature detection", unit="pixels", least=64
     )
     features: int = setting(4096, "maximum number of features per photograph", least=64)
     first_octave: int = setting(
         -1,
-        "first octave of the scale space: -1 first enlarges images twofold; 0 takes a quarter of "
-        "the time but may lose photographs of smooth objects",
+        "first octave of the scale space; -1: images are enlarged twofold first; 0: this takes a "
+        "quarter of the time, but may lose photographs of smooth objects",
         least=-1,
     )
     seed: int = setting(0, "random seed", least=0)
     exhaustive: int = setting(
         24,
-        "maximum number of photographs to match in all pairs; of more, match only similar pairs",
+        "up to this number of photographs, match all pairs; with more, match only similar pairs",
         least=2,
     )
     partners: int = setting(16, "number of similar photographs to match with each one", least=1)

@@ -167,24 +167,24 @@ def cutout(
 
     Args:
         out: folder to write to.
-        source: source of the masks: rembg, a network; none, depth only, which finds the object
-            that stands on a table in the middle; else a folder of masks.
+        source: source of the masks: rembg (a network); none (depth maps, which show the object
+            that stands on a table in the middle); or a folder of masks.
         downscale: photographs are reduced to 1/N; 0: as in `load_photos`.
         allow_outside: as in `load_photos`.
         network: rembg's network to use.
-        box: X0 Y0 Z0 X1 Y1 Z1, a box around the object in the world of the written cameras.
-        keep_table: with masks from depth, keep the table inside the box.
+        box: X0 Y0 Z0 X1 Y1 Z1, a box around the object, in world coordinates of the new cameras.
+        keep_table: with masks from depth, keep the part of the table that is inside the box.
 
     Raises:
         DataError: photographs or masks cannot be used, or depth separates no object.
-        ExistingFile: out exists already.
+        ExistingFile: out already exists.
         MissingExtra: the network is not installed.
         UserError: the masks have nothing in common, or arguments are inconsistent.
         OSError: a file cannot be written.
     """
     data, out, origin = Path(data), Path(out), str(source)
     if out.exists():
-        raise ExistingFile(f"{out} exists already: choose another folder for out", "out")
+        raise ExistingFile(f"{out} already exists: choose another folder for out", "out")
     check_masks(origin, network, box, keep_table)
     corners = None if box is None else object_shape.box_corners(box)
     masked = mask_network(network) if origin == REMBG else None
@@ -233,8 +233,8 @@ def check_masks(origin: str, network: str, box: Sequence[float] | None, keep_tab
     if keep_table and (box is None or origin != DEPTH):
         got = "no box" if box is None else f"masks from {origin}"
         raise UserError(
-            f"keep_table needs a box that bounds the table, and masks from depth ({DEPTH}), "
-            f"got {got}",
+            f"keep_table needs a box that bounds the table, and masks from depth (source: "
+            f"{DEPTH}), got {got}",
             "keep_table",
         )
 
@@ -251,11 +251,11 @@ def _from_depth(
         raise DataError(
             f"{splits['train'].folder}: depth does not separate the object from its surroundings. "
             f"Depth needs a textured object and cameras all around it. If you do not have these, "
-            f"use source={REMBG} or a folder of masks instead of {DEPTH}",
+            f"use source={REMBG} or a folder of masks instead of source={DEPTH}",
             "source",
         )
     _tell_evidence(shape, 0, box)
-    log.info("masks were made from depth: check masks.html")
+    log.info("masks were made from depth: check them in masks.html")
     return {name: _silhouettes_of(shape, split) for name, split in splits.items()}
 
 
@@ -316,12 +316,14 @@ def _judged(
             for stem, one in zip(split.names, masks[name], strict=True):
                 if not bool((one >= 128).any()):
                     where = "" if box is None else " inside the box"
-                    raise DataError(f"{split.folder}: the mask of {stem} is empty{where}")
+                    raise DataError(
+                        f"{split.folder}: the mask of {stem} is empty{where}: correct it"
+                    )
         log.warning(
-            "masks are not checked, because that needs %d photographs and there are only %d",
+            "masks are not checked, because this needs %d photographs and there are only %d",
             *(PHOTOGRAPHS, count),
         )
-        return _as_they_are(masks), "the masks are unchecked: there are too few photographs"
+        return _as_they_are(masks), "masks are not checked, because there are too few photographs"
     coverage = {name: [m.float() / 255 for m in those] for name, those in masks.items()}
     shape = object_shape.find_object(coverage["train"], depth_maps(train), box=box)
     _tell_evidence(shape, count, box)

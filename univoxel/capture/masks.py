@@ -78,7 +78,7 @@ def mask_network(name: NetworkName = NETWORK) -> Callable[[Tensor], Tensor]:
     except (ImportError, SystemExit):  # it ends Python where onnxruntime is missing
         return _by_onnxruntime(network, weights)
     if not weights.is_file():
-        log.info("%s: downloading the weights once, %g MB", name, network.megabytes)
+        log.info("%s: downloading the weights (%g MB, only once)", name, network.megabytes)
     try:
         session = rembg.new_session(name)
     except OSError as error:  # requests' errors are some
@@ -99,8 +99,8 @@ def _by_onnxruntime(network: Network, weights: Path) -> Callable[[Tensor], Tenso
     if onnxruntime is None or not weights.is_file():
         raise MissingExtra(
             "making masks with a network needs rembg: pip install 'univoxel[masks]'; or install "
-            f"onnxruntime and put the network's weights at {weights}; or pass your own masks: "
-            "cutout --from FOLDER, capture --masks FOLDER"
+            f"onnxruntime and put the network's weights at {weights}; or pass your own masks "
+            "with cutout --from FOLDER or capture --masks FOLDER"
         )
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
@@ -132,7 +132,7 @@ def timed(
     masked: Callable[[Tensor], Tensor], name: NetworkName, count: int
 ) -> Callable[[Tensor], Tensor]:
     """The same function, which tells after the first photograph how long so many take."""
-    log.info("masks: using the network %s, %g MB", name, NETWORKS[name].megabytes)
+    log.info("masks: using the network %s (%g MB)", name, NETWORKS[name].megabytes)
     first = True
 
     def measured(photograph: Tensor) -> Tensor:
@@ -142,7 +142,10 @@ def timed(
         if first:
             first, seconds = False, monotonic() - begun
             whole = duration(count * seconds)
-            log.info("masks: %.1f s per photograph, about %s for all %d", seconds, whole, count)
+            log.info(
+                "masks: %.1f s per photograph, about %s for all %d photographs",
+                *(seconds, whole, count),
+            )
         return mask
 
     return measured

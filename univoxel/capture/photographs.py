@@ -109,7 +109,7 @@ def find_photographs(folder: Path) -> tuple[list[Path], list[str], int]:
     where = ", ".join(str(p.relative_to(folder)) for p in inner[:NAMED])
     raise DataError(
         f"{folder}: expected photographs ({' '.join((*PLAIN, *HEIF))} or RAW), got none"
-        + (f", but {where} has some: pass it, or move all into one folder" if inner else "")
+        + (f", but {where} has some: pass that folder, or move all files into one" if inner else "")
     )
 
 
@@ -340,7 +340,7 @@ def _to_jpeg(video: Path, folder: Path) -> str:
     tags = next((w for w in words if w not in ("tv", "pc") and w not in FIELDS), "unknown")
     matrix, primaries, curve = tags.split("/") if tags.count("/") == 2 else [tags] * 3
     if matrix in OTHER_MATRICES:
-        log.warning("%s: %s colours may be converted wrongly: record in BT.709", video.name, matrix)
+        log.warning("%s: %s colours may come out wrong: record in BT.709", video.name, matrix)
     if primaries == "unknown" and (curve in HDR or matrix.startswith("bt2020")):
         primaries = "bt2020"
     if matrix == "unknown":
@@ -354,7 +354,7 @@ def _to_jpeg(video: Path, folder: Path) -> str:
         _write_table(folder / TABLE, stated, curve)
         table = f",lut3d=file={TABLE}:interp=tetrahedral"
     if curve in HDR:
-        said = "%s: %s colours (HDR) were tone mapped; detail brighter than white is mostly lost"
+        said = "%s: %s colours (HDR) were tone mapped, so most detail above white is lost"
         log.warning(said, video.name, HDR[curve])
     exact = "flags=bicubic+accurate_rnd+full_chroma_int"
     return (

@@ -215,5 +215,5 @@ def why_not(
         return f"connected to {elsewhere[number]} photographs, but not to the rest"
     best = max((n for a, b, n, _ in pairs if number in (a, b)), default=0)
     if best < NEEDED:
-        return f"at most {best} matches with one photograph; {NEEDED} are needed"
-    return f"{best} matches with one photograph, but these contradict the other matches"
+        return f"at most {best} matches with any other photograph, but {NEEDED} are needed"
+    return f"{best} matches with another photograph, but these contradict the other matches"

@@ -99,7 +99,7 @@ def poses(
     capture, unread = gather(files, masks)
     unread += others
     told = in_words(capture.photographs, capture.groups)
-    told += f"; {doubles} exist in two formats, of which one is used" if doubles else ""
+    told += f"; {doubles} photographs exist in two formats, of which one is used" if doubles else ""
     log.info(told + (f"; {len(unread)} could not be read: {_some(unread)}" if unread else ""))
     settings = _settings(source, masks, every, config, capture)
     used = {"keep_size": keep_size, "keep_weak": keep_weak}
@@ -256,7 +256,9 @@ def _search(
         stands = f"the background is static in {still} of {matching} pairs of photographs"
         if capture.masks is None:
             raise StillBackground(stands)
-        raise DataError(f"{stands}, and the masks include part of it: tighten the masks", "masks")
+        raise DataError(
+            f"{stands}, and the images in masks include part of it: tighten these masks", "masks"
+        )
     do(MODELS, structure.place, total)
     return unreadable
 
@@ -304,8 +306,9 @@ def _judge(capture: Capture, folders: Folders, unreadable: dict[int, str]) -> Fo
     if len(placed) < PLACED_SHARE * len(reports):
         missing = [f"{r.name} ({r.reason})" for r in reports if not r.placed]
         raise DataError(
-            f"only {len(placed)} of {len(reports)} photographs were registered. Take more, with "
-            f"more overlap, and do not move the object. Not registered: {_some(missing)}"
+            f"only {len(placed)} of {len(reports)} photographs were registered. Take more "
+            "photographs, with more overlap, and do not move the object. "
+            f"Not registered: {_some(missing)}"
         )
     return Found(models[0], weak, reports)
 
@@ -334,7 +337,7 @@ def _say(capture: Capture, found: Found, keep_weak: bool) -> None:
         fate = "kept" if keep_weak else "left out (keep_weak keeps them)"
         log.warning(
             f"{len(weak)} photographs may have poses that are wrong by several degrees. They are "
-            f"{fate}: {_some(weak)}. Photograph that side of the object again with more overlap",
+            f"{fate}: {_some(weak)}. Photograph the side that they show again, with more overlap",
             extra={"arguments": ("keep_weak",)},
         )
 

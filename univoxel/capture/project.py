@@ -83,7 +83,7 @@ def begin(project: Project, given: Given) -> None:
     def other(files: list) -> ExistingFile:
         why = _difference(files, given.files)
         return ExistingFile(
-            f"{out} contains a capture of {_words(files)}; {why}: choose another folder for out",
+            f"{out} contains a capture of {_words(files)}, but {why}: choose another folder as out",
             "out",
         )
 

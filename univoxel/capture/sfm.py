@@ -77,7 +77,7 @@ def run(request: Request, log: Path, done: Callable[[], int] | None = None) -> I
             yield count()
             if time.monotonic() - begin > limit:
                 raise ProcessFailed(
-                    f"{request.step}: pycolmap took over {request.seconds:.0f} s and was stopped"
+                    f"{request.step}: pycolmap was stopped after {request.seconds:.0f} s"
                 )
     if process.returncode:
         said = guard.last_words(log.read_bytes()) or "no message"

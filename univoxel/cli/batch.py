@@ -36,9 +36,9 @@ class BatchOptions:
     )
     """steps to run for each scene, in this order: poses masks train eval export page"""
     masks: Annotated[str, parsing.written("auto|rembg|FOLDER|none")] = "auto"
-    """source of the masks in the masks step, as for capture --masks"""
+    """source of the masks in the step masks; see capture --masks"""
     preset: choices.PresetOrAuto = "auto"
-    """amount of work, from draft to best; auto: to fit --minutes, or fast without it"""
+    """amount of work, from draft to best; auto: what fits in --minutes, else fast"""
     light: Annotated[choices.LightName, parsing.ADVANCED] = "hybrid"
     """lighting model; hybrid keeps shadows out of the albedo; the others are baselines"""
     minutes: parsing.Minutes = None
@@ -54,9 +54,9 @@ class BatchOptions:
     scheduler: parsing.Scheduler = None
     """Dask scheduler to use; anyone who can reach it can run code on its workers"""
     tries: Annotated[int, parsing.ADVANCED] = 3
-    """number of attempts at a scene whose process is killed"""
+    """maximum number of attempts at a scene whose process is killed"""
     json: parsing.JsonFile = None
-    """also write batch.json to this file; - prints it instead of the table"""
+    """also write batch.json to this file; use - to print it instead of the table"""
 
     def training(self) -> TrainConfig:
         """The configuration of a training; a UserError if there is none of that kind."""
@@ -69,7 +69,8 @@ class BatchOptions:
             return changed(config, self.changes)
         if (self.preset, self.light) != ("auto", "hybrid"):
             raise UserError(
-                f"config cannot be combined with preset or light: {self.config} sets both", "config"
+                f"config cannot be combined with preset or light: {self.config} sets both",
+                *("config", "preset", "light"),
             )
         config = load_config(self.config)
         minutes = config.minutes if self.minutes is None else self.minutes

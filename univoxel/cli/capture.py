@@ -44,15 +44,15 @@ class CaptureOptions:
     out: Annotated[Path, written("DIR")]
     """output folder, for scene/, cut/, run/, pictures/, the mesh and the page"""
     masks: Annotated[str, written("auto|rembg|FOLDER|none")] = AUTO
-    """source of the masks; auto: masks in PHOTOS, else a network, else depth only"""
+    """source of the masks; auto: masks in PHOTOS, else a network, else depth maps"""
     network: Annotated[choices.NetworkName, ADVANCED] = choices.NETWORK
     """network that makes the masks; those listed later are slower but more accurate"""
     box: BoxOf = None
-    """corners of a box around the object, in the world of scene/"""
+    """corners of a box around the object, in world coordinates of DIR/scene"""
     keep_table: Annotated[bool, ADVANCED] = False
     """keep the part of the table that is inside the box; needs --masks none"""
     preset: choices.PresetOrAuto = "auto"
-    """amount of work, from draft to best; auto: to fit --minutes, or fast without it"""
+    """amount of work, from draft to best; auto: what fits in --minutes, else fast"""
     light: Annotated[choices.LightName, ADVANCED] = "hybrid"
     """lighting model; hybrid keeps shadows out of the albedo; the others are baselines"""
     minutes: Minutes = None
@@ -60,7 +60,7 @@ class CaptureOptions:
     changes: Changes = ()
     """change one configuration field, such as loss.radiance=0.5; repeatable"""
     until: choices.Until = "page"
-    """last step to run; cameras and masks stop before training and print the folder"""
+    """last step to run; cameras and masks end before training and print their folder"""
 
     @property
     def fingerprint(self) -> Any:
@@ -97,7 +97,9 @@ def command(asked: CaptureOptions) -> int:
         print(made.mesh)
         return code_of(made.run)
     if (*training.values(), asked.changes) != ("auto", "hybrid", None, ()):
-        raise UserError(f"with --until {until}, leave out --preset, --light, --minutes and --set")
+        raise UserError(
+            f"--until {until} does not train: leave out --preset, --light, --minutes and --set"
+        )
     print(find_data(*where, **masks, until=until))
     return 0
 
@@ -190,7 +192,7 @@ def capture(
         if not (project.run / FILE).exists():
             seconds = slowdown(training) * sum(map(expected_seconds, training.stages))
             said = f"training takes about {duration(seconds)} on this machine"
-            log.info(f"{said}, once cameras are found and masks are made")
+            log.info(f"{said}, after cameras are found and masks are made")
         scene = _find_cameras(project, given, asked, config)
         data = _find_masks(project, scene, asked)
         run = _train(replace(training, data=data.absolute(), out=project.run), on_progress)
@@ -309,7 +311,7 @@ def _find_cameras(
         try:
             return poses(given.path, done, config=config)
         except StillBackground as error:
-            log.info(f"{error.seen}, as on a turntable, so masks are made before cameras")
+            log.info(f"{error.seen}, as on a turntable, so masks are made before cameras are found")
             files.finish(project.out, TURNED, True)
     first = _masks_before_cameras(project, given, asked)
     _say("cameras", f"found from the masked parts of {given.path}")
@@ -388,7 +390,7 @@ def _find_masks(project: Project, scene: Path, asked: CaptureOptions) -> Path:
     if masks == AUTO and not turned and _have_masks(project, scene):
         if asked.box is not None:
             raise UserError(
-                f"{scene} already has masks, so box would have no effect. To make new masks inside "
+                f"{scene} already has masks, so a box would have no effect. To make masks inside "
                 f"the box, pass masks={choices.REMBG}, masks={choices.DEPTH} or a folder of masks",
                 "masks",
             )
@@ -399,7 +401,7 @@ def _find_masks(project: Project, scene: Path, asked: CaptureOptions) -> Path:
         source = scene / "masks"  # those that the cameras were found with
     else:
         source = _network_or_depth(asked.network) if masks == AUTO else asked.masks
-    words = {choices.REMBG: "from a network", choices.DEPTH: "from depth only"}
+    words = {choices.REMBG: "from a network", choices.DEPTH: "from depth maps"}
     _say("masks", words.get(str(source), f"from {source}"))
     return cutout(
         *(scene, project.cut, source),
@@ -418,7 +420,7 @@ def _network_or_depth(name: choices.NetworkName) -> str:
     except MissingExtra as missing:
         if name != choices.NETWORK:  # which nobody names for nothing
             raise
-        log.info(f"no mask network is installed, so masks are made from depth only ({missing})")
+        log.info(f"no mask network is installed, so masks are made from depth maps ({missing})")
         return choices.DEPTH
     return choices.REMBG
 
@@ -507,7 +509,7 @@ def _picture(project: Project, run: Path, config: PicturesConfig) -> None:
     try:
         evaluate(run, save=folder / "test", json=measures)
     except DataError as error:  # such as a run whose photographs are elsewhere now
-        log.warning(f"no metrics: {error}")
+        log.warning(f"metrics are missing: {error}")
     return None
 
 

@@ -17,15 +17,15 @@ class CutoutOptions:
     out: Annotated[Path, written("DIR")]
     """folder to write to"""
     source: Annotated[str, written("rembg|FOLDER|none", "rembg", name="from")] = "rembg"
-    """source of the masks: rembg (a network), none (depth only), or a folder of masks"""
+    """source of the masks: rembg (a network), none (depth maps), or a folder of masks"""
     network: NetworkName = NETWORK
     """network that makes the masks; those listed later are slower but more accurate"""
     box: BoxOf = None
-    """corners of a box around the object, in the world of the written cameras"""
+    """corners of a box around the object, in world coordinates of the written cameras"""
     keep_table: bool = False
     """keep the part of the table that is inside the box; needs --from none"""
     downscale: DownscaleBy = "auto"
-    """write photographs at 1/N of their size; auto: as large as the grids can use"""
+    """write photographs at 1/N of their size; auto: longer side of about 1000 pixels"""
     allow_outside: bool = False
     """also read files outside the folder if the data set refers to them"""
 

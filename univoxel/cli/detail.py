@@ -63,7 +63,7 @@ def command(asked: DetailOptions) -> Path | None:
     made = write(load_scene(run), photos_of(run, data, "train"), run, asked.size)
     if made is None:
         log.info(
-            "%s: no texture added, because the photographs show no more detail than the grid", run
+            "%s: no texture was added, because photographs show no more detail than the grid", run
         )
     return made
 
@@ -111,13 +111,10 @@ def made_after_training(
     if detail == "none":
         return None
     if until is not None and time.monotonic() > until:
-        log.info(
-            "detail: no time was left for the texture; to add it, run `univoxel detail %s`",
-            run,
-        )
+        log.info("detail: no time was left for a texture: run `univoxel detail %s` to add it", run)
         return None
     try:
         return write(scene, photos, run)
     except (UserError, OSError, ValueError) as error:  # a run without it is one, too
-        log.warning("detail: no texture added: %s", error)
+        log.warning("detail: no texture was added: %s", error)
         return None

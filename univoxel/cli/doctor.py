@@ -42,7 +42,7 @@ class Finding:
 @dataclass(frozen=True)
 class DoctorOptions:
     json: JsonFile = None
-    """write the findings to a file as JSON; - prints them instead of the table"""
+    """write the findings to a file as JSON; use - to print them instead of the table"""
 
 
 @takes(DoctorOptions)
@@ -101,12 +101,7 @@ def embree(status: NativeStatus) -> Finding:
     """Whether rays can be traced."""
     if status.embree is not None:
         return Finding("Embree", f"{status.embree}")
-    return Finding(
-        "Embree",
-        "missing: training and relighting need it",
-        "bad",
-        REBUILD,
-    )
+    return Finding("Embree", "missing, but training and relighting need it", "bad", REBUILD)
 
 
 def openmp(runtimes: Sequence[str]) -> Finding:
@@ -137,7 +132,7 @@ def memory(found: machine.Memory | None) -> Finding:
         return Finding("memory", total)
     said = f"{found.free / 2**30:.1f} GiB free of {total}"
     if found.free < ENOUGH:
-        return Finding("memory", said, "look", "train with --downscale, or close other programs")
+        return Finding("memory", said, "look", "use a larger --downscale, or close other programs")
     return Finding("memory", said)
 
 
@@ -145,7 +140,7 @@ def extra_findings() -> list[Finding]:
     """A finding for each extra."""
     known = extras()
     if known is None:
-        return [Finding("extras", "unknown: the package is on the path, but not installed")]
+        return [Finding("extras", "unknown, because univoxel is importable but not installed")]
     found = []
     for name, missing in known.items():
         finding = Finding(f"extra {name}", "installed")

@@ -33,9 +33,11 @@ def command(asked: EnvmapOptions) -> None:
     print(asked.out)
     if found:
         under = "under this map and the true one: PSNR"
-        print(f"diffuse sphere {under} {found.ball_psnr:.1f} dB, scaled per channel")
+        print(f"diffuse sphere {under} {found.ball_psnr:.1f} dB, after scaling each channel")
         print(f"chrome sphere {under} {found.mirror_psnr:.1f} dB")
-        print(f"brightest directions of both maps: {found.brightest_degrees:.1f} degrees apart")
+        print(
+            f"the brightest directions of the maps are {found.brightest_degrees:.1f} degrees apart"
+        )
 
 
 @takes(EnvmapOptions)

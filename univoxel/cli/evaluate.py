@@ -31,7 +31,7 @@ class EvaluateOptions:
     save: Annotated[parsing.File | None, parsing.written("DIR", "none are written")] = None
     """folder to write the rendered images to"""
     json: parsing.JsonFile = None
-    """write the metrics to a file as JSON; - prints them instead of the table"""
+    """write the metrics to a file as JSON; use - to print them instead of the table"""
     samples: int = SAMPLES
     """number of light samples per pixel in relit images"""
     bounces: Annotated[int, parsing.ADVANCED] = BOUNCES
@@ -44,7 +44,6 @@ class EvaluateOptions:
     """background of the novel views"""
     fit_light: Annotated[bool, parsing.ADVANCED] = False
     """fit the light to each test photograph before measuring, as many papers do"""
-
     full_size: bool = False
     """also measure novel views at full size, with the full-size texture of the run"""
 
@@ -150,7 +149,7 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
         try:
             train = photos_of(run, data, "train")
         except (UserError, OSError) as error:  # views are the model's only
-            log.info("full size: without photographs, novel views use only the model: %s", error)
+            log.info("full size: no photographs found, so novel views use only the model: %s", error)
             train = None
         result |= measure_full_size(scene, run, photos, train, save)
     figures = views.say_trust(surveyed, report.get("troubles", []), save)

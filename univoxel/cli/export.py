@@ -35,7 +35,7 @@ class ExportOptions:
     faces: Annotated[int | None, written("N", "20000 with textures, else no limit")] = None
     """maximum number of triangles, at least 4"""
     texture_size: Annotated[
-        int | None, written("TEXELS", "as the full-size texture, else 1024")
+        int | None, written("TEXELS", "that of the full-size texture, else 1024")
     ] = None
     """width of the square textures, a power of 2 up to 4096"""
     watertight: bool = False
@@ -49,7 +49,7 @@ class ExportOptions:
     origin: Annotated[choices.Origin, ADVANCED] = "upright"
     """position of the origin; world: as in the data set; upright: the same, with +Z up"""
     lods: Annotated[int, written("N", advanced=True)] = 0
-    """also write N coarser levels, each with a quarter of the triangles"""
+    """also write N coarser meshes, each with 1/4 of the triangles of the one before"""
 
     def __post_init__(self) -> None:
         if self.faces is not None and self.faces < 4:

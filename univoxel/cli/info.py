@@ -50,9 +50,9 @@ class InfoOptions:
     run: Run
     """folder of a trained run"""
     json: JsonFile = None
-    """write the numbers to a file as JSON; - prints them instead of the tables"""
+    """write the numbers to a file as JSON; use - to print them instead of the tables"""
     picture: Annotated[File | None, written("FILE.png", "none")] = None
-    """image to write; shows where features are stored and the size of each part"""
+    """image to write, which shows where features are stored and the size of each part"""
 
 
 @takes(InfoOptions)

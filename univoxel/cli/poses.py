@@ -16,11 +16,11 @@ class PosesOptions:
     photographs: Annotated[Path, written("PHOTOS", positional=True)]
     """folder of JPEG, PNG, TIFF, WebP, HEIC or RAW photographs; or a video"""
     out: Annotated[Path, written("SCENE")]
-    """folder to write to; delete its sfm/ when you are done"""
+    """folder to write to; you can delete its subfolder sfm/ when you are done"""
     masks: Annotated[Path | None, written("DIR", "the whole images")] = None
-    """folder of masks, to detect features inside them only; required on a turntable"""
+    """folder of masks inside which to detect features; required for a turntable"""
     every: Annotated[float | None, written("SECONDS", "80 frames in all")] = None
-    """from each period of this length in a video, take the sharpest frame"""
+    """for a video: take the sharpest frame of each period of this length"""
     keep_size: Annotated[int, written("PIXELS", advanced=True)] = KEEP_SIZE
     """maximum width and height of the written photographs; 0: original size"""
     keep_weak: Annotated[bool, ADVANCED] = False
@@ -30,7 +30,7 @@ class PosesOptions:
     features: Annotated[int | None, written("N", "4096; with --fast: 2048", advanced=True)] = None
     """maximum number of features per photograph"""
     fast: bool = False
-    """detect features four times faster, but fewer; may lose views of smooth objects"""
+    """detect fewer features, four times faster; may lose views of smooth objects"""
     seed: Annotated[int, ADVANCED] = 0
     """random seed"""
 

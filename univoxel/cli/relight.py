@@ -49,7 +49,7 @@ class RelightOptions:
         tuple[tuple[float, ...], ...],
         written("AZIMUTH ELEVATION IRRADIANCE [ANGLE]", name="sun", repeatable=True),
     ] = ()
-    """distant light; angles in degrees, ANGLE is its diameter (0.53); repeatable"""
+    """distant light; angles in degrees; ANGLE: its diameter, default 0.53; repeatable"""
     point_lights: Annotated[
         tuple[tuple[float, float, float, float], ...],
         written("X Y Z INTENSITY", name="point", repeatable=True),
@@ -58,11 +58,11 @@ class RelightOptions:
     cameras: Annotated[str, written("test|orbit|FILE")] = "test"
     """test views, an orbit around the object, or a path from a transforms.json"""
     ground: Annotated[str | None, written("lowest|HEIGHT")] = None
-    """add a floor that receives shadows, at this height or below the lowest point"""
+    """add a floor that receives shadows, at this height or at the lowest point"""
     elevation: Annotated[float, written("DEGREES", advanced=True)] = ELEVATION
     """elevation of an orbit above the horizon"""
     turn: Annotated[int | None, written("FRAMES", advanced=True)] = None
-    """keep the first camera and rotate the light once in this number of frames"""
+    """use the first camera, and rotate the light once around in this many frames"""
     resolution: Annotated[int | None, written("PIXELS", "as photographed; orbits: 512")] = None
     """width of the images"""
     rotate: Annotated[float, written("DEGREES", advanced=True)] = 0.0
@@ -124,11 +124,11 @@ class RelightOptions:
 @dataclass(frozen=True, kw_only=True)
 class Relight(RelightOptions, Where):  # whose fields come first
     orbit: Annotated[int | None, written("FRAMES")] = None
-    """orbit around the object in this number of frames"""
+    """orbit around the object once in this many frames"""
     animation: Annotated[tuple[Animation, ...], written(default="none")] = ()
     """also write the frames as an animation"""
     resume: bool = False
-    """keep frames that already exist"""
+    """keep frames that already exist, and render only the others"""
 
 
 @takes(Relight)

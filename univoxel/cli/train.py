@@ -28,33 +28,33 @@ class TrainOptions:
     out: Annotated[parsing.File, parsing.written("RUN")]
     """folder to write the run to"""
     preset: choices.PresetOrAuto = "auto"
-    """amount of work, from draft to best; auto: to fit --minutes, or fast without it"""
+    """amount of work, from draft to best; auto: what fits in --minutes, else fast"""
     light: Annotated[choices.LightName, parsing.ADVANCED] = "hybrid"
     """lighting model; hybrid keeps shadows out of the albedo; the others are baselines"""
     varying: Annotated[choices.Differing, parsing.ADVANCED] = "auto"
-    """what varies between photographs; auto: exposure or light, if detected"""
+    """what varies between photographs; auto: detect whether exposure or light does"""
     light_frame: Annotated[choices.LightFrameOrAuto, parsing.ADVANCED] = "auto"
     """world: the light is fixed; turntable: it moves with the camera; camera: a flash"""
     metal: Annotated[choices.Metal, parsing.ADVANCED] = "auto"
-    """all: the whole object is metal, even with patina; some: it is not; auto: detect"""
+    """all: the whole object is metal (or patina); some: not all of it is; auto: detect"""
     detail: choices.DetailingOrAuto = "auto"
-    """texture: refine the albedo from full-size photographs; auto: except with draft"""
+    """texture: refine the albedo at full size; auto: do so except with draft or baked"""
     masks: choices.MasksFrom = "auto"
     """auto: erode masks that extend past the object's edge; given: use them unchanged"""
     cameras: choices.CamerasFrom = "auto"
-    """refined: optimise camera poses; auto: only if silhouettes are inconsistent"""
+    """refined: optimise camera poses; auto: do so if silhouettes are inconsistent"""
     field: Annotated[choices.FieldName, parsing.ADVANCED] = "hash"
     """where features are stored: hash table, every grid node, or bricks at the surface"""
     capacity: Annotated[choices.CapacityOrAuto, parsing.ADVANCED] = "auto"
-    """adaptive: shrink the model if PSNR allows; auto: if field and light support it"""
+    """adaptive: shrink the model with little loss of PSNR; auto: if this is supported"""
     budget_mb: Annotated[float | None, parsing.written("MB", "no limit", advanced=True)] = None
     """maximum size of the model file in megabytes; implies --capacity adaptive"""
     config: parsing.ConfigFile = None
     """reuse the config.json of another run instead of --preset, --light and others"""
     minutes: parsing.Minutes = None
-    """time limit, including preparation; all stages are shortened by the same factor"""
+    """time limit, including preparation; stages run fewer steps if it is short"""
     downscale: parsing.DownscaleBy = "auto"
-    """train at 1/N of the photographs' size; auto: as large as the grids can use"""
+    """train at 1/N of the photographs' size; auto: longer side of about 1000 pixels"""
     allow_outside: Annotated[bool, parsing.ADVANCED] = False
     """also read files outside the folder if the data set refers to them"""
     seed: Annotated[int | None, parsing.written("N", "0, or from --config", advanced=True)] = None
@@ -101,7 +101,7 @@ class TrainOptions:
 
         for field in fields(TrainOptions):
             if field.name not in OWN and (value := getattr(self, field.name)) != field.default:
-                both = f"{field.name}={value} cannot be combined with config: {file} sets it"
+                both = f"{field.name}={value} cannot be combined with config: {file} sets it too"
                 raise UserError(both, "config", field.name)
         config = replace(load_config(file), data=Path(self.data), out=Path(self.out))
         return config if self.minutes is None else replace(config, minutes=self.minutes)
@@ -110,7 +110,7 @@ class TrainOptions:
 @dataclass(frozen=True, kw_only=True)
 class Train(TrainOptions):
     resume: bool = False
-    """resume the run in --out, or start it if nothing was saved yet"""
+    """resume the run in --out, or start a new run if nothing was saved yet"""
     timelapse: Annotated[
         str | None, parsing.written("FILE.gif|FILE.mp4|DIR/", "none", advanced=True)
     ] = None
@@ -118,9 +118,9 @@ class Train(TrainOptions):
     view: bool = False
     """watch the training in a browser, where you can also end it early"""
     host: Annotated[str | None, parsing.written("ADDRESS", "127.0.0.1", advanced=True)] = None
-    """address for --view to listen on"""
+    """address on which --view listens"""
     port: Annotated[int | None, parsing.written("N", "8080", advanced=True)] = None
-    """port for --view to listen on"""
+    """port on which --view listens"""
     no_page: Annotated[bool, parsing.ADVANCED] = False
     """do not write RUN/index.html"""
 

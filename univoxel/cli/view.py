@@ -19,7 +19,7 @@ class ViewOptions:
     run: Run
     """folder of a trained run"""
     html: Annotated[File | None, written("FILE.html", "a server")] = None
-    """write a page that works offline, and do not start the server"""
+    """write a page that works offline, instead of starting the server"""
     envmap: Annotated[tuple[File, ...], written("MAP [MAP ...]", "the built-in maps")] = ()
     """additional environment maps to offer"""
     title: Title = None

@@ -280,5 +280,5 @@ def _value(old, text: str):
     if isinstance(old, float) and type(new) is int:
         new = float(new)
     if type(new) is not type(old):
-        raise ConfigError(f"expected a {type(old).__name__} such as {old!r}, got {text!r}")
+        raise ConfigError(f"expected a value such as {old!r} ({type(old).__name__}), got {text!r}")
     return new

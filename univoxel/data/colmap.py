@@ -68,13 +68,13 @@ def list_colmap(folder: Path, split: str) -> Listed:
     for image in images:  # all of them, before a picture is opened
         if image.name in names or not image.name or "\0" in image.name:
             raise DataError(
-                f"{images_file}: expected unique, non-empty names of images, got {image.name!r}"
+                f"{images_file}: expected unique, non-empty image names, got {image.name!r}"
             )
         names.add(image.name)
     shots, missing, scaled = [], [], 0
     for image in images:
         if image.camera not in cameras:
-            raise DataError(f"{images_file}: camera {image.camera} of {image.name} does not exist")
+            raise DataError(f"{images_file}: {image.name} refers to missing camera {image.camera}")
         path = find_photo(folder, image.name, str(images_file))
         if path is None:
             missing.append(image.name)
@@ -85,15 +85,15 @@ def list_colmap(folder: Path, split: str) -> Listed:
             lens, scaled = fitted(lens, path, cameras_file.name), scaled + 1
         elif (width, height) != (lens.width, lens.height):
             raise DataError(
-                f"{path}: expected {lens.width}x{lens.height} pixels, as its camera in "
-                f"{cameras_file.name} has, got {width}x{height}{turn_note(path)}"
+                f"{path}: expected {lens.width}x{lens.height} pixels, the size of its "
+                f"camera in {cameras_file.name}, got {width}x{height}{turn_note(path)}"
             )
         inner = PurePosixPath(image.name.replace("\\", "/"))
         name = inner.with_suffix("").as_posix().replace("/", "_")
         shots.append(Shot(name, str(images_file), path, None, image.pose, lens))
     note = f" (looked in {folder / 'images'} and {folder})"
     lost = left_out(str(images_file), missing, len(images), note)
-    lost += [f"{scaled} cameras scaled to smaller images"] if scaled else []
+    lost += [f"{scaled} cameras scaled to match smaller images"] if scaled else []
     if len(models) > 1:
         lost = [f"{model.relative_to(folder)}, the largest of {len(models)} models", *lost]
     return turned_up(folder, split, "COLMAP model", shots, lost, listed_split)
@@ -206,7 +206,7 @@ def _cameras_text(path: Path) -> Iterator[tuple[int, str, int, int, list[float]]
             continue
         number, model, width, height, *rest = line.split()
         if len(rest) != _parameters(path, int(number), model):
-            raise ValueError(f"camera {number}: {len(rest)} parameters do not fit {model}")
+            raise ValueError(f"camera {number}: {len(rest)} parameters do not fit model {model}")
         yield int(number), model, int(width), int(height), [float(value) for value in rest]
 
 

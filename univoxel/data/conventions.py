@@ -68,8 +68,8 @@ def check_skew(skew: float, lens: Lens, where: str) -> None:
     lean = abs(skew) * lens.height / 2 / lens.focal[1]
     if not lean <= SKEW:
         raise DataError(
-            f"{where}: expected rows and columns of pixels to be perpendicular, got a skew of "
-            f"{lean:.3g} pixels (skew {skew:.4g})"
+            f"{where}: expected perpendicular rows and columns of pixels, got rows shifted by up "
+            f"to {lean:.3g} pixels (skew {skew:.4g})"
         )
 
 
@@ -81,5 +81,5 @@ def parsed(text: str | None, what: str, where: str) -> float:
         value = math.nan
     if not math.isfinite(value):
         came = "nothing" if text is None else short(text)
-        raise DataError(f"{where}: expected a number as {what}, got {came}")
+        raise DataError(f"{where}: expected a number for {what}, got {came}")
     return value

@@ -77,7 +77,7 @@ def read_radiance(path: Path) -> np.ndarray:
     height, width = int(size[1]), int(size[2])
 
     if height * width > LARGEST:
-        raise DataError(f"{path}: expected up to {LARGEST} pixels, got {width}x{height}")
+        raise DataError(f"{path}: expected at most {LARGEST} pixels, got {width}x{height}")
     # A flat file cannot start with the marker: its largest mantissa would be below 128.
     marker = bytes([2, 2, width >> 8 & 255, width & 255])
     if 8 <= width < 32768 and body.startswith(marker):
@@ -341,11 +341,11 @@ def _read_exr(path: Path) -> tuple[dict[str, np.ndarray], Sequence[float]]:
         raise DataError(f"{path}: this OpenEXR file could not be read: {error}") from None
     if len(colored) > 1:
         raise DataError(
-            f"{path}: expected one image, got several parts with colours ({names}): write the "
-            "part you want to its own file"
+            f"{path}: expected one image, got several parts with colours ({names}): save the "
+            "part that you want to a file of its own"
         )
     if len({pixels.shape for pixels in channels.values()}) != 1:
-        raise DataError(f"{path}: expected channels of one size, got subsampled channels")
+        raise DataError(f"{path}: expected channels of the same size, got subsampled ones")
     if not np.array_equal(data, shown):
         channels = {name: _framed(p, data, shown, path) for name, p in channels.items()}
     return {name: np.asarray(pixels, np.float32) for name, pixels in channels.items()}, stated
@@ -525,7 +525,7 @@ def as_array(image: Image.Image, path: Path, in_srgb: bool = False) -> np.ndarra
     if image.mode.startswith("I;16"):
         return np.asarray(image, np.float32)[..., None] / 65535
     if image.mode in ("I", "F"):
-        raise DataError(f"{path}: expected an image with 8 or 16 bits, got 32 bits: convert it")
+        raise DataError(f"{path}: expected 8 or 16 bits per channel, got 32: convert the image")
     grey = image.mode in ("1", "L")
     mode = "L" if grey else "RGBA" if image.has_transparency_data else "RGB"
     source = image

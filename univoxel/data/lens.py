@@ -70,10 +70,13 @@ def checked(lens: Lens) -> Lens:
             f"{lens.width}x{lens.height}, got {x:.4g} and {y:.4g}"
         )
     if not all(abs(at) <= high for at in lens.centre):
-        raise UserError(f"principal point: expected at most {high:.4g} pixels, got {lens.centre}")
+        raise UserError(
+            f"expected principal point coordinates from {-high:.4g} to {high:.4g} pixels, got "
+            f"{lens.centre}"
+        )
     if not all(abs(k) <= STRONGEST for k in (*lens.radial, *lens.tangential)):
         raise UserError(
-            f"expected distortion coefficients up to {STRONGEST:.0e}, got "
+            f"expected distortion coefficients of magnitude up to {STRONGEST:.0e}, got "
             f"{(*lens.radial, *lens.tangential)}"
         )
     return lens
@@ -91,13 +94,13 @@ def straightened(lens: Lens) -> Lens:
         return lens
     low, high = ZOOM
     if not _fits(lens, high):
-        raise UserError(f"the lens distortion leaves less than 1/{high:g} of the image width")
+        raise UserError(f"removing lens distortion would leave less than 1/{high:g} of the width")
     for _ in range(HALVINGS):
         middle = (low + high) / 2
         low, high = (low, middle) if _fits(lens, middle) else (middle, high)
     pinhole = _zoomed(lens, high)
     if _folds(lens, pinhole):
-        raise UserError("the lens distortion folds the image over: check the coefficients")
+        raise UserError("the lens distortion folds the image over itself: check its coefficients")
     return pinhole
 
 

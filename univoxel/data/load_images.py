@@ -461,7 +461,7 @@ def _stored(picture: Tensor, of_color: torch.dtype, of_alpha: torch.dtype) -> tu
 def every_eighth(folder: Path, shots: Sequence[Shot], split: str) -> list[Shot]:
     """The test split: the first of every eight photographs in order of names; train: the others."""
     if split not in ("train", "test"):
-        raise DataError(f"{folder}: expected split train or test, got {split}")
+        raise DataError(f"{folder}: expected train or test as the split, got {split}")
     ordered = sorted(shots, key=lambda shot: shot.name)
     chosen = [s for i, s in enumerate(ordered) if (i % TEST_EVERY == 0) == (split == "test")]
     if not chosen:
@@ -517,7 +517,7 @@ def upright(shots: Sequence[Shot]) -> tuple[list[Shot], list[str]]:
     held = np.stack([_right_and_up(shot) for shot in shots])
     up = up_direction(held)
     if up is None:
-        return shots, [*moved, "world not rotated, because cameras do not show which way is up"]
+        return shots, [*moved, "world not rotated, because the cameras do not show which way is up"]
     if up[2] >= math.cos(LEAN):
         return shots, moved
     turned = in_moved_world(shots, np.column_stack([turn_to_z(up), np.zeros(3)]))
@@ -581,6 +581,6 @@ def _check(folder: Path, shots: Sequence[Shot], downscale: int) -> None:
         width, height = shot.lens.width, shot.lens.height
         if downscale > min(width, height):
             raise DataError(
-                f"{folder}: downscale={downscale} is too large for {width}x{height} pixels",
+                f"{folder}: downscale={downscale} is too large for {width}x{height} images",
                 "downscale",
             )

@@ -100,7 +100,7 @@ def masks_in(folder: Path, photographs: Named) -> list[Path]:
     """
     if not folder.is_dir():
         what = "a file" if folder.exists() else "nothing there"
-        raise DataError(f"{folder}: expected a folder of masks, got {what}", "masks")
+        raise DataError(f"{folder}: expected a folder of masks, got {what}")
     files = _pictures(folder)
     if not files:
         raise DataError(f"{folder}: expected masks ({' '.join(SUFFIXES)}), found no image")
@@ -214,7 +214,7 @@ def _paired(masks: Sequence[Path], root: Path | None, photographs: Named) -> lis
         if root is not None and mask and whose.setdefault(mask, image) != image:
             raise DataError(
                 f"{mask}: expected a mask of one photograph, but its name matches {whose[mask]} "
-                f"and {image}: put each mask into a subfolder named like that of its photograph, "
+                f"and {image}: put each mask into a subfolder of the same name as its photograph, "
                 f"or name it after the whole file name, such as {image.name}.png"
             )
         found.append(mask)
@@ -402,7 +402,7 @@ def _of_palette(image: Image.Image, path: Path) -> Tensor:
     if len(things) > 1 or palette[0].any():
         named = [f"{n}: {palette[min(n, len(palette) - 1)].tolist()}" for n in used]
         raise DataError(
-            f"{path}: expected a mask of one object, got {len(used)} colours of a palette "
+            f"{path}: expected a mask of one object, got {len(used)} palette colours "
             f"({some(named)}): {WHITE}"
         )
     return torch.from_numpy(255 * (numbers > 0).astype(np.uint8))
@@ -460,7 +460,7 @@ def _scaled(levels: Tensor, path: Path) -> Tensor:
     if code <= LABELS:
         raise DataError(
             f"{path}: expected a mask that is white on the object, got values of at most {code} "
-            f"of 255, as in label images: {WHITE}"
+            f"of 255, as in images of labels: {WHITE}"
         )
     return levels.clamp(0, 1) if floating else levels.contiguous()
 

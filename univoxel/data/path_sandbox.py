@@ -74,7 +74,7 @@ def left_out(where: str, missing: Sequence[object], listed: int, note: str = "")
             f"and at least {FEWEST}{note}"
         )
     log.warning("%s: missing images: %s (%s left out)", where, names, count)
-    return [f"{count} listed images are missing and left out"]
+    return [f"{count} listed images were left out because they are missing"]
 
 
 # Arrays in the files of NumPy.

@@ -91,7 +91,7 @@ def list_metashape(folder: Path, split: str) -> Listed:
             continue
         if sensor not in lenses:
             lenses[sensor] = _sensor_lens(
-                sensors.get(sensor), f"{path}: sensor {sensor} of {label}"
+                sensors.get(sensor), f"{path}: sensor {sensor} of camera {label}"
             )
         pose = _camera_pose(camera, world, where)
         lens = fitted(lenses[sensor], picture, where)
@@ -102,7 +102,7 @@ def list_metashape(folder: Path, split: str) -> Listed:
     if len(every) > len(chosen):
         told = "not placed, not enabled or in another component"
         if rig := sum(c.get("master_id") is not None for c in every if c not in placed):
-            told += f"; {rig} belong to a rig, whose pose is that of a master camera"
+            told += f"; {rig} belong to a rig, of which only the master camera has a pose"
         lost += [f"{len(every) - len(chosen)} of {len(every)} cameras left out: {told}"]
     return turned_up(folder, split, "Metashape cameras", shots, lost)
 
@@ -178,7 +178,7 @@ def _sensor_lens(sensor: ET.Element | None, where: str) -> Lens:
     focal = parsed(calibration.findtext("f"), "f", where)
     term = {key: parsed(calibration.findtext(key, "0"), key, where) for key in TERMS}
     if term["p3"] or term["p4"]:
-        raise DataError(f"{where}: expected distortion k1 to k4, p1 and p2 only, got p3 or p4 too")
+        raise DataError(f"{where}: expected distortion terms k1 to k4, p1 and p2, got p3 or p4")
     values = {"fl_x": focal + term["b1"], "fl_y": focal}
     values |= {"cx": width / 2 + term["cx"], "cy": height / 2 + term["cy"]}
     values |= {"p1": term["p2"], "p2": term["p1"]}

@@ -76,11 +76,9 @@ def _placed(folder: Path, pictures: list[Path]) -> list[Path]:
 def _rows(path: Path) -> np.ndarray:
     rows = read_npy(path)
     if rows.ndim != 2 or rows.shape[1] != COLUMNS:
-        raise DataError(f"{path}: expected {COLUMNS} numbers a row, got {np.shape(rows)}")
+        raise DataError(f"{path}: expected rows of {COLUMNS} numbers, got shape {np.shape(rows)}")
     if rows.dtype.kind not in "fiu" or not len(rows):
-        raise DataError(
-            f"{path}: expected {COLUMNS} numbers in each row, got {len(rows)} x {rows.dtype}"
-        )
+        raise DataError(f"{path}: expected rows of numbers, got {len(rows)} rows of {rows.dtype}")
     return rows.astype(np.float64)
 
 
@@ -158,7 +156,7 @@ def decomposed(matrix: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
     """
     matrix = matrix * (1 if np.linalg.det(matrix[:, :3]) > 0 else -1)
     if not np.linalg.cond(matrix[:, :3]) < 1e12:
-        raise DataError(f"{where}: expected a projection matrix, got a singular one")
+        raise DataError(f"{where}: expected an invertible projection matrix, got a singular one")
     upper, rotation = rq(matrix[:, :3])
     signs = np.sign(np.diag(upper))  # focal lengths are positive; that they are so is all there is
     upper, rotation = upper * signs, signs[:, None] * rotation
@@ -176,11 +174,11 @@ def _matrices(path: Path) -> dict[int, np.ndarray]:
     arrays = read_npz(path, PREFIX)
     found = {int(key.removeprefix(PREFIX)): a for key, a in arrays.items() if KEY.fullmatch(key)}
     if not found:
-        raise DataError(f"{path}: expected arrays world_mat_0, world_mat_1 .., got none")
+        raise DataError(f"{path}: expected arrays world_mat_0, world_mat_1 and so on, got none")
     for number, matrix in found.items():
         if matrix.shape not in ((4, 4), (3, 4)) or matrix.dtype.kind not in "fiu":
             raise DataError(
-                f"{path}: expected world_mat_{number} [4, 4] of numbers, got "
+                f"{path}: expected a 4x4 matrix of numbers as world_mat_{number}, got "
                 f"{list(matrix.shape)} of {matrix.dtype}"
             )
         if not np.isfinite(matrix).all():
@@ -225,7 +223,7 @@ def _numbers(path: Path, known: list[int], pictures: list[Path]) -> list[int]:
     if found and set(found) <= set(known) and len(set(found)) == len(found):
         return found
     raise DataError(
-        f"{path}: expected a world_mat for each of {len(pictures)} photographs in "
+        f"{path}: expected a matrix world_mat for each of {len(pictures)} photographs in "
         f"{pictures[0].parent}, got {len(known)}, whose numbers do not match the photographs' names"
     )
 
@@ -275,7 +273,7 @@ def list_neilf(folder: Path, split: str) -> Listed:
         lens, pose = _camera(image, where)
         shots.append(Shot(picture.stem, where, picture, None, pose, fitted(lens, picture, where)))
     if unplaced == len(names):
-        raise DataError(f"{path}: expected images with cameras (flg {PLACED}), got none")
+        raise DataError(f"{path}: expected images with cameras (flg is {PLACED}), got none")
     looked = f" (looked in {folder / 'inputs' / 'images'})"
     lost = left_out(str(path), missing, len(names) - unplaced, looked)
     lost += [f"{unplaced} photographs left out because they have no camera"] if unplaced else []
@@ -296,7 +294,7 @@ def _read(path: Path) -> tuple[dict[str, str], dict]:
     except (KeyError, TypeError, AttributeError) as error:
         raise DataError(
             f"{path}: expected JSON with image_path.file_paths and camera_track_map.images, "
-            f"got {error!r}"
+            f"but reading these failed: {error!r}"
         ) from None
     return found, images
 
@@ -338,7 +336,7 @@ def list_tensoir(folder: Path, split: str) -> Listed:
     """Photographs under the light of the training views."""
     views = sorted(path.parent for path in folder.glob(f"{split}_*/metadata.json"))
     if not views:
-        raise DataError(f"{folder}: expected {split}_000/metadata.json and so on, got none")
+        raise DataError(f"{folder}: expected {split}_000/metadata.json and so on, found none")
     picture = photographed(folder)
     there = [view for view in views if (view / picture).is_file()]
     missing = [view / picture for view in views if view not in there]
@@ -374,8 +372,8 @@ def _shot(view: Path, picture: str) -> Shot:
         raise
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(
-            f"{path}: expected JSON with cam_transform_mat, numbers separated by commas, got "
-            f"{error!r}"
+            f"{path}: expected JSON with cam_transform_mat, numbers separated by commas, but "
+            f"reading it failed: {error!r}"
         ) from None
     if len(values) != 16:
         raise DataError(f"{path}: expected 16 numbers in cam_transform_mat, got {short(text)}")

@@ -159,7 +159,7 @@ def read_frames(path: Path) -> tuple[dict[str, Any], list[load_images.Shot], lis
             "larger images, add the width and height of those as w and h",
             *(path, first.width, first.height),
         )
-    lost += [f"{scaled} cameras scaled to smaller images"] if scaled else []
+    lost += [f"{scaled} cameras scaled to match smaller images"] if scaled else []
     return root, shots, lost
 
 
@@ -233,7 +233,7 @@ def _found_as_written_elsewhere(folder: Path, names: Sequence[str], where: str) 
             found = _in_any_case(folder, parts, known) if parts else []
             if len(found) > 1:
                 both = " and ".join(map(str, found[:2]))
-                raise DataError(f"{where}: expected one image {path}, got {both}: rename one")
+                raise DataError(f"{where}: expected one image named {path}, got {both}: rename one")
             if found:
                 return found[0]
     return None
@@ -304,7 +304,7 @@ def pose_of(matrix: object, where: str) -> np.ndarray:
     u, scale, v = np.linalg.svd(pose[:3, :3])
     if np.abs(scale - 1).max() > RIGID_TOLERANCE:
         raise DataError(
-            f"{where}: expected a rigid transform_matrix (a rotation), got one that scales by "
+            f"{where}: expected rotation and translation in transform_matrix, got a scale of "
             f"{scale[0]:.4g}, {scale[1]:.4g}, {scale[2]:.4g}"
         )
     if np.linalg.det(pose[:3, :3]) < 0:
@@ -331,7 +331,7 @@ def lens_of(values: dict[str, Any], where: str, width: int, height: int, note: s
             + ("a fisheye" if values.get("is_fisheye") else short(model))
         )
     if more := [key for key in ("k4", "k5", "k6") if values.get(key)]:
-        raise DataError(f"{where}: expected only distortion by k1 k2 k3 p1 p2, got {more[0]}")
+        raise DataError(f"{where}: expected only distortion terms k1 k2 k3 p1 p2, got {more[0]}")
     if "fl_x" in values:
         x = read_number(values, "fl_x", where, 0.0, math.inf)
         y = read_number(values, "fl_y", where, 0.0, math.inf) if "fl_y" in values else x
@@ -420,7 +420,7 @@ def is_blender(folder: Path, split: str) -> bool:
 def list_blender(folder: Path, split: str) -> load_images.Listed:
     path = folder / f"transforms_{split}.json"
     if not path.is_file():
-        raise DataError(f"{folder}: expected {path.name} beside transforms_train.json, found none")
+        raise DataError(f"{folder}: {path.name} is missing beside transforms_train.json")
     _, shots, remarks = read_frames(path)
     train = folder / "transforms_train.json"
     if train.is_file():  # all splits in one world
@@ -473,5 +473,5 @@ def _named(
         raise DataError(f"{path}: expected {key} to list only frames of this file, got {came}")
     found = [by_name[name] for name in names if name in by_name]
     if not found:
-        raise DataError(f"{path}: expected images of frames in {key}, found none of {len(names)}")
+        raise DataError(f"{path}: expected images of the frames in {key}, found 0 of {len(names)}")
     return found

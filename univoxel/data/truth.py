@@ -62,7 +62,7 @@ def orb_geometry(path: Path, key: str, camera_to_world: Tensor) -> tuple[Tensor,
     fits = array.ndim == 3 and array.shape[2] == 3 if key == "normal" else array.ndim == 2
     if not fits or array.dtype.kind != "f" or not np.isfinite(array).all():
         raise DataError(
-            f"{path}: expected finite {shape}, got {list(array.shape)} of {array.dtype}"
+            f"{path}: expected finite values {shape}, got {list(array.shape)} of {array.dtype}"
         )
     value = torch.from_numpy(array.astype(np.float32))
     if key == "depth":
@@ -119,7 +119,7 @@ def read_ply(path: Path) -> Mesh:
             f"{path}: expected vertices x y z and triangles, but could not read them: {error}"
         ) from None
     if (sides != 3).any() or (len(index) and not 0 <= index.min() <= index.max() < len(corner)):
-        raise DataError(f"{path}: expected triangles that index the {len(corner)} vertices")
+        raise DataError(f"{path}: expected triangles with vertex indices below {len(corner)}")
     if not np.isfinite(corner).all():
         raise DataError(f"{path}: expected finite vertices, got NaN or infinity")
     return Mesh(torch.from_numpy(corner), torch.from_numpy(index))
@@ -212,7 +212,7 @@ def load_points(folder: str | Path) -> Tensor | None:
     arrays = read_npz(path)
     points = arrays.get("points")
     if points is None or points.ndim != 2 or points.shape[1] != 3 or not len(points):
-        raise DataError(f"{path}: expected an array points [P, 3], got {_shapes(arrays)}")
+        raise DataError(f"{path}: expected an array points of shape [P, 3], got {_shapes(arrays)}")
     with np.errstate(over="ignore"):
         points = points.astype(np.float32)
     if not np.isfinite(points).all():
@@ -235,7 +235,7 @@ def _arrays(path: Path, factor: int) -> Truth:
     arrays = read_npz(path)
     shape = arrays["alpha"].shape if "alpha" in arrays else None
     if shape is None or len(shape) != 2:
-        raise DataError(f"{path}: expected an array alpha [H, W], got {_shapes(arrays)}")
+        raise DataError(f"{path}: expected an array alpha of shape [H, W], got {_shapes(arrays)}")
     wanted = {"albedo": (*shape, 3), "roughness": shape, "normal": (*shape, 3), "depth": shape}
     alpha = torch.from_numpy(arrays["alpha"].astype(np.float32) / 255)
     fields: dict[str, Tensor] = {"mask": shrink(alpha[..., None], factor)[..., 0] > WHOLE}
@@ -245,7 +245,7 @@ def _arrays(path: Path, factor: int) -> Truth:
         with np.errstate(over="ignore"):  # what is infinite then is refused
             value = arrays[key].astype(np.float32)
         if value.shape != size:
-            raise DataError(f"{path}: expected {key} of {list(size)}, got {list(value.shape)}")
+            raise DataError(f"{path}: expected {key} of size {list(size)}, got {list(value.shape)}")
         if not np.isfinite(value).all():
             raise DataError(f"{path}: expected finite {key}, got NaN or infinity")
         fields[key] = _shrunk(key, torch.from_numpy(value), alpha, factor)

@@ -265,9 +265,7 @@ def make_detail(scene: Scene, photos: Photos, size: int | None = None) -> Detail
     errors = torch.tensor([baking.errors(*read) for read in _read(photos, held)])  # [H, 2]
     before, after = errors.nanmean(0).tolist() if len(held) else (math.nan, math.nan)
     if not after < before:
-        log.info(
-            "detail: no texture added, because it would not improve the prediction of photographs"
-        )
+        log.info("detail: no texture added, because it would not help to predict other photographs")
         return None
     for view, picture in _read(photos, held):
         baking.add(view, picture)
@@ -468,7 +466,7 @@ def load_detail(run: str | Path) -> Detail | None:
             came = f"{about.get('format')!r:.40}"
             raise DataError(f"{path}: expected a texture in format {FORMAT}, got {came}; {remedy}")
         if about["checkpoint"] != _fingerprint(Path(run)):
-            raise DataError(f"{path}: made for another checkpoint than {CHECKPOINT}; {remedy}")
+            raise DataError(f"{path}: belongs to another version of {CHECKPOINT}; {remedy}")
         if about["picture"] != _digest(picture):
             raise DataError(f"{picture}: does not belong to {MESH}; {remedy}")
         albedo = torch.from_numpy(np.array(Image.open(picture).convert("RGB")))

@@ -327,11 +327,11 @@ FULL_MEASURES = {
     "full_psnr": "full size: PSNR of the object in novel views, dB, after scaling each channel",
     "full_ssim": "full size: SSIM",
     **{
-        f"full_coherence_{k + 1}": f"full size, coherence in octave {k + 1}" for k in range(OCTAVES)
+        f"full_coherence_{k + 1}": f"full size: coherence in octave {k + 1}" for k in range(OCTAVES)
     },
     "full_model_psnr": "full size, model only: PSNR, dB",
     **{
-        f"full_model_coherence_{k + 1}": f"full size, model only, coherence in octave {k + 1}"
+        f"full_model_coherence_{k + 1}": f"full size, model only: coherence in octave {k + 1}"
         for k in range(OCTAVES)
     },
 }

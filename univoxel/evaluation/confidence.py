@@ -236,7 +236,7 @@ def compare(
     """Mean absolute sRGB difference between photographs and render, and root mean square of the
     render's slope by roughness: [P] each; 0 for points without observations.
 
-    A clipped pixel is only a lower bound of the brightness.
+    A clipped pixel is only a lower bound on the brightness.
 
     Args:
         which: indices of the points and observations that are compared.
@@ -413,8 +413,8 @@ def words(figures: dict[str, float], troubles: list[str]) -> str:
         if figures[name] >= MIN_SHARE:
             sentences.append(f"{figures[name]:.0%} of the surface {text}.")
     sentences.append(
-        "Photographs cannot tell a bright albedo from a bright light: compare albedos with one "
-        "another, not with a colour chart."
+        "A bright albedo and a bright light look the same in photographs, so compare albedos with "
+        "one another, not with a colour chart."
     )
     if troubles:
         last = f"The last one: {troubles[-1]}."

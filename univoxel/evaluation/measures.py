@@ -254,8 +254,8 @@ def every_nth(photos: Photos, trained: list[str], every: int) -> Photos:
     chosen = sorted([*photos.names, *trained])[::every]
     if seen := sorted(set(chosen) & set(trained)):
         raise UserError(
-            f"test_every {every} selects {len(seen)} training photographs, such as "
-            f"{seen[0]}: no test view may have been used for training",
+            f"test_every {every} selects {len(seen)} photographs that were used for "
+            f"training, such as {seen[0]}: choose a number that selects none of these",
             "test_every",
         )
     return photos.of(torch.tensor([photos.names.index(name) for name in chosen]))
@@ -289,17 +289,17 @@ MEASURES = {
     "nvs_psnr": "novel views, PSNR, dB",
     "nvs_ssim": "novel views, SSIM",
     "albedo_psnr_raw": "albedo PSNR, dB, without scaling",
-    "albedo_psnr_1ch": "albedo PSNR, dB, scaled by one factor",
-    "albedo_psnr_3ch": "albedo PSNR, dB, scaled per channel",
-    "albedo_psnr_fg": "albedo PSNR, dB, scaled per channel, inside the mask",
-    "roughness_mse": "roughness MSE, inside the mask",
-    "relit_psnr": "relit PSNR, dB, with the albedo scaled per channel",
-    "relit_psnr_raw": "relit PSNR, dB, without scaling of the albedo",
-    "normal_mae_deg": "normals, mean error inside the mask, degrees",
+    "albedo_psnr_1ch": "albedo PSNR, dB, after scaling by one factor",
+    "albedo_psnr_3ch": "albedo PSNR, dB, after scaling each channel",
+    "albedo_psnr_fg": "albedo PSNR inside the mask, dB, after scaling each channel",
+    "roughness_mse": "roughness MSE inside the mask",
+    "relit_psnr": "relit PSNR, dB, after scaling each channel of the albedo",
+    "relit_psnr_raw": "relit PSNR, dB, without scaling the albedo",
+    "normal_mae_deg": "mean error of the normals inside the mask, degrees",
     "chamfer": "Chamfer distance, world units",
-    "trust_spearman": "rank correlation of expected and true albedo error",
-    "trust_spearman_roughness": "rank correlation of expected and true roughness error",
-    "trust_spearman_normal": "rank correlation of expected and true normal error",
+    "trust_spearman": "rank correlation between expected and true albedo error",
+    "trust_spearman_roughness": "rank correlation between expected and true roughness error",
+    "trust_spearman_normal": "rank correlation between expected and true normal error",
     "train_seconds": "training time, seconds",
     "threads": "threads used in training",
     "peak_rss_mb": "peak memory during training, MB",

@@ -44,7 +44,7 @@ def recovered_map(scene: Scene, run: Path, height: int) -> Tensor:
     if sky is None:
         raise UserError(
             f"{run}: this run has no environment map, because it was trained with local light "
-            f"({scene.cfg.light.kind}) only"
+            f"({scene.cfg.light.kind})"
         )
     return scene.exposed(sky.latlong(height))
 

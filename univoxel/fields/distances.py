@@ -295,7 +295,7 @@ def unpack(packed: dict[str, Tensor], size: tuple[int, int, int], far: float) ->
     piece, first = _pieces(near)
     side = packed["side"].float()
     if len(side) != len(first):
-        raise ValueError(f"expected the sides of {len(first)} pieces of the grid, got {len(side)}")
+        raise ValueError(f"expected signs for {len(first)} pieces of the grid, got {len(side)}")
     side = torch.cat([torch.zeros(1), side])
     sdf = far * side[torch.from_numpy(piece).long()]
     sdf.view(-1)[rows] = packed["values"].float()

@@ -26,7 +26,7 @@ class GridShape:
         check_fields(self, "finite", lambda x: all(map(math.isfinite, x)), "origin")
         check_fields(
             self,
-            "at least 2 along each axis, below 2^31 in all",
+            "at least 2 along each axis and below 2^31 in all",
             lambda x: min(x) > 1 and math.prod(x) < MOST,
             "size",
         )

@@ -97,7 +97,7 @@ class EnvmapSGConfig(LatLongConfig):
     kind: Literal["envmap-sg"] = field(default="envmap-sg", init=False, metadata=KIND)
     lobes: int = setting(128, "number of lobes", least=1)
     max_sharpness: float = setting(
-        100.0, "maximum sharpness of a lobe, whose half width is sqrt(2 / sharpness) rad", above=0
+        100.0, "maximum sharpness of a lobe; the half width is sqrt(2 / sharpness) rad", above=0
     )
     rows: int = setting(
         64, "number of rows of the map that the lobes are rendered to", least=1, most=MOST_ROWS

@@ -19,13 +19,13 @@ class MLPLightConfig(LocalLightConfig):
     """Local light as two networks."""
 
     kind: Literal["mlp"] = field(default="mlp", init=False, metadata=KIND)
-    rank: int = setting(32, "number of basis functions that make up the light", least=1)
+    rank: int = setting(32, "number of basis functions that the light combines", least=1)
     hidden: int = setting(64, "width of both networks", least=1)
     layers: int = setting(2, "number of hidden layers of both networks", least=0, most=MOST_LAYERS)
     frequencies: int = setting(3, "number of frequencies in the encoding of the direction", least=0)
     directions: int = setting(256, "directions in training", least=1, most=MOST_DIRECTIONS)
     directions_eval: int = setting(512, "directions in evaluation", least=1, most=MOST_DIRECTIONS)
-    scale: float = setting(1.0, "half the size of the object's box", unit="world units", above=0)
+    scale: float = setting(1.0, "half the longest side of the box", unit="world units", above=0)
 
     __post_init__ = check_settings
 

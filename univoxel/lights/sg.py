@@ -69,9 +69,9 @@ class SGConfig(LocalLightConfig):
     directions: int = setting(64, "directions in training", least=1, most=MOST_DIRECTIONS)
     directions_eval: int = setting(256, "directions in evaluation", least=1, most=MOST_DIRECTIONS)
     max_sharpness: float = setting(
-        30.0, "maximum sharpness of a lobe, whose half width is sqrt(2 / sharpness) rad", above=0
+        30.0, "maximum sharpness of a lobe; the half width is sqrt(2 / sharpness) rad", above=0
     )
-    scale: float = setting(1.0, "half the size of the object's box", unit="world units", above=0)
+    scale: float = setting(1.0, "half the longest side of the box", unit="world units", above=0)
 
     __post_init__ = check_settings
 

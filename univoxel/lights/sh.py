@@ -20,12 +20,12 @@ class SHConfig(LocalLightConfig):
     """Local light in spherical harmonics."""
 
     kind: Literal["sh"] = field(default="sh", init=False, metadata=KIND)
-    order: int = setting(3, "highest degree; a point has 3 (order + 1)^2 coefficients", least=0)
+    order: int = setting(3, "highest degree; each point has 3 (order + 1)^2 coefficients", least=0)
     hidden: int = setting(64, "width of the head", least=1)
     layers: int = setting(2, "number of hidden layers of the head", least=0, most=MOST_LAYERS)
     directions: int = setting(256, "directions in training", least=1, most=MOST_DIRECTIONS)
     directions_eval: int = setting(512, "directions in evaluation", least=1, most=MOST_DIRECTIONS)
-    scale: float = setting(1.0, "half the size of the object's box", unit="world units", above=0)
+    scale: float = setting(1.0, "half the longest side of the box", unit="world units", above=0)
 
     __post_init__ = check_settings
 

@@ -27,8 +27,8 @@ def view_number(names: Sequence[str], view: str, argument: str) -> int:
     if view.isdigit() and int(view) < len(names):
         return int(view)
     raise UserError(
-        f"{argument}: expected a number below {len(names)} or a name from {names[0]} to "
-        f"{names[-1]}, got {view!r}",
+        f"{argument}: expected the number of a view (below {len(names)}) or its name (from "
+        f"{names[0]} to {names[-1]}), got {view!r}",
         argument,
     )
 
@@ -209,7 +209,7 @@ class Table:
     axis: Vec3 = field(metadata=about("unit vector along the axis, pointing up"))
     start: Vec3 = field(metadata=about("unit vector from the axis to the first camera"))
     eyes: tuple[Vec3, ...] = setting(
-        (), "positions of the cameras around this axis; empty: those of all cameras"
+        (), "positions of the cameras around this axis; empty: all cameras are around it"
     )
 
     def __post_init__(self) -> None:
@@ -260,7 +260,7 @@ class Turntable(Table):
     turned over to show its underside, the photographs after that have another axis, in `others`.
     """
 
-    others: tuple[Table, ...] = setting((), "rotation axes of the object's other positions")
+    others: tuple[Table, ...] = setting((), "rotation axes for the other positions of the object")
 
     def __post_init__(self) -> None:
         super().__post_init__()

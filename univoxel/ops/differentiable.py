@@ -180,9 +180,7 @@ class Differentiable(native.Operator):
         outputs = get_args(hints["return"]) or (Tensor,)
         lists = LIST in tensors.values()
         assert [*arguments] == [*tensors, *options], "tensors come before options"
-        assert not lists or to == [*tensors], (
-            "with lists, `to` must name all tensor arguments"
-        )
+        assert not lists or to == [*tensors], "with list arguments, `to` must name every tensor"
         self._to = [[*tensors].index(n) for n in to]
         self._count, self._tensors = len(arguments), len(tensors)
         self._held, self._shown = held, len(outputs) - held
@@ -357,7 +355,7 @@ class _Once(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:
         raise RuntimeError(
-            f"{ctx.name}: cannot differentiate twice, because only the reference of this op has "
+            f"{ctx.name}: cannot differentiate twice, because only the reference of the op has "
             'second derivatives: use univoxel.ops.use_backend("reference")'
         )
 

@@ -97,8 +97,8 @@ def check_levels(
     each = rows // levels
     if each * levels != rows or each < 1 or each & (each - 1) or each > 2**31:
         raise ValueError(
-            f"{op}: the number of rows of table must be a power of two for each of {levels} "
-            f"levels, got {rows} in all"
+            f"{op}: the number of rows of table per level must be a power of two, got {rows} "
+            f"rows for {levels} levels"
         )
 
 

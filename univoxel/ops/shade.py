@@ -170,7 +170,7 @@ def _check_rest(op: str, directions: Tensor, solid_angle: float, **constants: Te
         raise ValueError(f"{op}: solid_angle must be above 0 and finite, got {solid_angle}")
     for name, tensor in constants.items():
         if tensor.requires_grad and torch.is_grad_enabled():
-            raise NotImplementedError(f"{op}: no gradient with respect to {name}: detach it")
+            raise NotImplementedError(f"{op}: gradients for {name} are not supported: detach it")
 
 
 def shade_radiance_reference(

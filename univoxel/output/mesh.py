@@ -246,7 +246,10 @@ def bake(
     texel, face, barycentric = rasterise(uv, faces, size)
     weight = corner_weights(barycentric)
     if not len(texel):
-        raise UserError(f"a texture of {size} x {size} is too small for {len(faces)} faces")
+        raise UserError(
+            f"a texture of {size} x {size} is too small for {len(faces)} faces: choose a larger "
+            "texture or fewer faces"
+        )
     seen = None if mesh.seen is None else mesh.seen[source]
     area = torch.linalg.cross(*_edges_at(mesh.vertices[mesh.faces.long()], 0))
     footprint = float((0.5 * area.norm(dim=1).sum() / len(texel)).sqrt())  # world units
@@ -343,8 +346,8 @@ def placement_of(
     turn, at = torch.from_numpy(moved[:, :3].T.copy()), torch.from_numpy(moved[:, 3].copy())
     if (away := float((middle - at).norm())) > FARTHEST * side:
         raise UserError(
-            f"export: the object of size {side:.4g} is {away:.6g} away from the origin, which is "
-            "too far for the precision of mesh files: use another origin",
+            f"export: with origin=world, the object of size {side:.4g} is {away:.6g} away from the "
+            "origin, which is too far for the precision of mesh files: use another origin",
             "origin",
         )
     return Placement(at, scale, turn)

@@ -238,10 +238,10 @@ LICENCE = (
     "Drawn with three.js (\u00a9 three.js authors; its MIT licence is in the source of the page)."
 )
 SOURCES = {name: f"Map {name!r}: Greg Zaal, Poly Haven, CC0." for name in PHOTOGRAPHED}
-KEYS = """1 to 5: layers
+KEYS = """1 to 5: show a layer
 Left, Right: rotate the light; Space: rotate it continuously
-L: let dragging rotate the light instead of the view; so does holding Shift
-B: backdrop, S: save the image, 0: first view"""
+L, or hold Shift: dragging rotates the light instead of the view
+B: show the backdrop; S: save the image; 0: return to the first view"""
 
 
 @dataclass(frozen=True)

@@ -287,8 +287,8 @@ def next_section(advice: Advice) -> str:
             "these directions: turn the object over and photograph it again, or accept the gap."
         )
     told.append(
-        f"The front is where {advice.front_name} was taken. Left and right are as seen from "
-        "the front. Keep the distance and the light of the other photographs."
+        f"The front is the side from which {advice.front_name} was taken. Left and right are as "
+        "seen from the front. Keep the distance and the light of the other photographs."
     )
     parts += [paragraph(line) for line in told]
     legend = (
@@ -319,14 +319,14 @@ def views_section(scene: Scene, known: Known, options: ReportOptions) -> str:
     rows = []
     for view in found:
         kind = "" if view.trained else " (not trained on)"
-        words = f"{view.name}{kind}: mean error {view.error:.3f} in sRGB, {view.quality:.1f} dB"
+        words = f"{view.name}{kind}: mean error {view.error:.3f} (sRGB), PSNR {view.quality:.1f} dB"
         tiles = "".join(image(tile, words) for tile in view.tiles)
         caption = f"<figcaption>{escape(words)}</figcaption>"
         rows.append(f'<figure class="row">{tiles}{caption}</figure>')
     said = (
-        f"The {len(found)} of {count} compared photographs that differ most from their render: "
-        f"photograph, render and difference, which is white at {report_pictures.LIMIT} in sRGB. "
-        "The numbers ignore the background."
+        f"The {len(found)} of {count} compared photographs that differ most from their render. "
+        "From left to right: photograph, render and difference, which is white at "
+        f"{report_pictures.LIMIT} in sRGB or more. The background does not count."
     )
     return paragraph(said) + f'<div class="views">{"".join(rows)}</div>'
 
@@ -354,7 +354,7 @@ def light_section(scene: Scene, mesh: Mesh) -> str:
     tiles = zip(names, report_pictures.pictures_of(found), strict=True)
     legend = (
         "Spheres are seen from +X, with +Z up. The brightness of each channel is unknown, "
-        "because photographs cannot tell a bright light from a bright albedo."
+        "because a bright light and a bright albedo look the same in photographs."
     )
     return paragraph(found.about) + gallery(tiles, legend, "light")
 

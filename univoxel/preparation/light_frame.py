@@ -199,8 +199,8 @@ def light_frame_of(
         lit = 2 * flashed.saved > found.saved
     if lit:
         log.info(
-            "light: there is a flash at the camera. It explains %.0f %% more of the colour changes "
-            "between photographs than a fixed light does; light_frame overrides this",
+            "light: there is a flash on the camera. It explains %.0f %% more of the colour changes "
+            "between photographs than a fixed light does; light_frame=world switches this off",
             100 * flashed.saved,
             extra={"arguments": ("light_frame",)},
         )
@@ -211,7 +211,7 @@ def light_frame_of(
     assert found is not None
     log.info(
         "light: it rotates with the camera, as on a turntable%s. This explains %.0f %% of the "
-        "colour changes between photographs (a fixed light: %.0f %%); light_frame overrides this",
+        "colour changes between photographs (fixed light: %.0f %%); light_frame=world disables it",
         f" with {len(turntable.tables)} positions of the object" if turntable.others else "",
         100 * found.by_turning_light,
         100 * max(found.by_still_light, 0.0),  # none, where the other half contradicts it

@@ -221,9 +221,9 @@ def box_shown(cameras: Cameras, view: int, box: Tensor) -> Tensor:
 def nothing_inside(box: Tensor, what: str, cameras: Cameras) -> UserError:
     """What to raise where the box [2, 3] is in the wrong place."""
     return UserError(
-        f"box: expected a box around the object, got {words_of(box.flatten().tolist())}, in "
-        f"which {what}; the cameras look at {words_of(looked_at(cameras).tolist())}, and at least "
-        f"half of them see the cube that extends {reach(cameras):.4g} in each direction from there",
+        f"box: expected a box around the object, got {words_of(box.flatten().tolist())}, "
+        f"where {what}. The cameras look at {words_of(looked_at(cameras).tolist())}, and at least "
+        f"half of them see the cube that extends {reach(cameras):.4g} from there in each direction",
         "box",
     )
 
@@ -260,7 +260,7 @@ def find_object(
     grid = around(coarse, likely, voxels**3) if likely.any() else coarse
     inside, surface = evidence(votes(shown, maps, grid), threshold, shown, maps, grid, box)
     if not (inside > 0).any() and box is not None:
-        raise nothing_inside(box, "masks and depth leave no shape", cameras)
+        raise nothing_inside(box, "masks and depth agree on no shape", cameras)
     if not (inside > 0).any():
         raise UserError(
             "the masks of the photographs are too faint or too few to determine the object's shape"

@@ -341,7 +341,7 @@ def _say(seen: Agreement | None, off: float, believed: bool, refined: bool) -> N
         lie = f"the epipolar error is {seen.median:.2f} pixels"
         contradicting = f"{contradicting}, and {lie}"
     if believed and not refined:
-        then = "the masks are assumed to be rough; better masks improve the result"
+        then = "the masks are assumed to be rough; better masks would improve the result"
     else:
         then = "camera poses are refined" if refined else "try cameras=refined"
     log.info("%s: %s", contradicting, then, extra={"arguments": ("cameras",)})

@@ -202,7 +202,7 @@ def varying_and_gains(
     stops = float(gains.square().mean().sqrt()) / math.log(2)
     if varying == "none":
         left = contradictions_left(seen) if stops >= MIN_STOPS else 1.0
-        log.debug("exposures: gains of %.2f stops leave %.2f of the differences", stops, left)
+        log.debug("exposures: gains of %.2f stops; %.2f of the differences remain", stops, left)
         if left > MOST_LEFT:
             return varying, None
         varying = "exposure"

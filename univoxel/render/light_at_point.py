@@ -89,7 +89,7 @@ def ray_of(photos: Photos, view: int, pixel: tuple[int, int]) -> Rays:
     size = photos.cameras.size(view)
     if not all(0 <= p < n for p, n in zip(pixel, size, strict=True)):
         raise UserError(
-            f"pixel: expected a pixel inside {size[0]}x{size[1]}, got {pixel[0]},{pixel[1]}",
+            f"pixel: expected a pixel of a {size[0]}x{size[1]} image, got {pixel[0]},{pixel[1]}",
             "pixel",
         )
     return pixel_rays(photos.cameras, torch.tensor([view]), torch.tensor([pixel]) + 0.5)

@@ -63,7 +63,7 @@ def contact_sheet(rows: list[tuple[str, list[Panel]]]) -> np.ndarray:
     """
     titles = [[panel.title for panel in panels] for _, panels in rows]
     if not rows or any(t != titles[0] for t in titles) or not titles[0]:
-        raise ValueError(f"contact_sheet: expected rows of the same quantities, got {titles}")
+        raise ValueError(f"contact_sheet: expected rows with the same panels, got {titles}")
     sizes = [_tile_size(panels[0].estimate) for _, panels in rows]
     cell = max(TILE, *(width for width, _ in sizes)) + GAP  # titles need their room, too
     margin = 8 + 8 * max(len(name) for name, _ in rows)

@@ -326,11 +326,7 @@ class Clock:
         if not (short := self.short()):
             return ""
         stages = ", ".join(f"{made:.0%} of {name}" for name, made in short.items())
-        why = (
-            "the training was stopped early"
-            if self.finished
-            else "training ended at the time limit"
-        )
+        why = "training was stopped early" if self.finished else "training ended at the time limit"
         return f"{why} (completed steps: {stages})"
 
     def minutes_for_all(self) -> float:

@@ -469,7 +469,7 @@ def grid_in_budget(scene: Scene, cfg: TrainConfig, stage: StageConfig) -> list[C
     most = voxels_that_fit(scene, 1e6 * cfg.budget_mb)
     if most >= limit:
         return []
-    return [CapacityChoice("voxels", limit, most, 0.0, f"the budget leaves room for {most:,}")]
+    return [CapacityChoice("voxels", limit, most, 0.0, f"the budget has room for {most:,} voxels")]
 
 
 def reduce_storage_(

@@ -58,7 +58,7 @@ MIN_PARTS = 2
 
 
 NEWTON_CHUNK = 256  # points whose equations are built at once
-UNSOLVABLE = "the equations for the environment map have no solution: it is unchanged in this round"
+UNSOLVABLE = "the environment map is unchanged in this round: its equations have no solution"
 
 
 @dataclass(frozen=True)

@@ -167,7 +167,7 @@ class Progress:
         if not needed and self.clock.hurried and not self._goes_on:
             self.skipped.append(what)
             log.info(
-                f"minutes is too short for a step of the preparation, which is skipped: {what}",
+                f"the limit minutes is too short, so a step of the preparation is skipped: {what}",
                 extra={"arguments": ("minutes",)},
             )
         return what not in self.skipped

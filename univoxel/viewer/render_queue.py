@@ -112,7 +112,7 @@ class Studio:
                 self._give_up(viewer, chore, str(error))
             except Exception:
                 log.exception("rendering failed")  # a fault of the program: its traceback
-                self._give_up(viewer, chore, "rendering failed: see univoxel's terminal")
+                self._give_up(viewer, chore, "rendering failed: see the terminal of univoxel")
 
     def _next(self, turn: int) -> tuple[Viewer, str | None] | None:
         """The viewer whose turn it is, and its chore, if not its view; None: all are served."""

@@ -146,7 +146,7 @@ class Panel:
         try:
             photos = self._subject.photos
         except (UserError, OSError) as error:
-            log.info("no photographs to show: %s", error)
+            log.info("the photographs cannot be shown: %s", error)
             return
         self._overlay = gui.add_slider("photograph", 0.0, 1.0, 0.05, 0.0)
         self._overlay.on_update(lambda event: self._last is not None and self._show(self._last))
@@ -182,7 +182,7 @@ class Panel:
         room = 0.02 * (high - low).norm()
         low, high = low - room, high + room
         self._boxed = gui.add_checkbox(
-            "box", False, hint="drag the corners, or click on the object to move the bottom there"
+            "box", False, hint="drag its corners, or click on the object to move its bottom there"
         )
         self._option = gui.add_markdown("", visible=False)
         self._corners = [

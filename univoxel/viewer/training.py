@@ -68,7 +68,7 @@ def _guard(server: Any, host: str) -> None:
     """Answer pages of this server only, and tell nobody outside of it."""
 
     def refused(*args: Any, **options: Any) -> None:
-        log.warning("refused the request of a page to share the viewer on the internet")
+        log.warning("refused a web page's request to share the viewer on the internet")
 
     server.request_share_url = refused  # would open a tunnel to a host outside
     inner = server._websock_server
@@ -78,7 +78,7 @@ def _guard(server: Any, host: str) -> None:
         websocket = inner._live_connections[connection.client_id]
         headers = websocket.request.headers
         if not same_site(headers.get("Origin"), headers.get("Host"), host):
-            log.warning("refused a page of %s that tried to use the viewer", headers.get("Origin"))
+            log.warning("refused a web page of %s access to the viewer", headers.get("Origin"))
             await websocket.close(1008, "another site")
 
 
@@ -105,7 +105,7 @@ def _require_port(host: str, port: int) -> None:
 
 def _taken(host: str, port: int) -> UserError:
     return UserError(
-        f"{host}:{port} is in use or not available; pass another port, or 0 for any free one",
+        f"{host}:{port} is in use or not available; pass another port, or 0 for any free port",
         "port",
     )
 
@@ -251,7 +251,7 @@ class Spectators:
         try:
             yield
         except UserError as error:  # such as no surface yet
-            log.debug("no image of the training: %s", error)
+            log.debug("the training could not be rendered: %s", error)
         except Exception:
             self._failed = True
             log.exception("the view of the training failed and is closed; training continues")
