@@ -126,8 +126,8 @@ def hull_of(photos: Photos) -> tuple[torch.Tensor, GridShape]:
     return visual_hull(distance, photos.cameras, grid), grid
 
 
-def scene_of(albedo, roughness: float, nodes: int):
-    """The sphere with one material everywhere, under a grey map."""
+def scene_of(albedo, roughness: float, nodes: int, map: torch.Tensor | None = None):
+    """The sphere with one material everywhere, under a map [D, 3], or a grey one."""
     scene = sphere_scene(nodes)
     last = scene.material.net[-1]
     low = scene.material.min_roughness
@@ -135,4 +135,6 @@ def scene_of(albedo, roughness: float, nodes: int):
     with torch.no_grad():
         last.weight.zero_()
         last.bias.copy_(torch.logit(wanted, eps=1e-6))
+        if map is not None:
+            scene.sky.log_radiance.copy_(map.log())
     return scene

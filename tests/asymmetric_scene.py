@@ -4,6 +4,9 @@ import math
 
 import torch
 
+from univoxel.camera import Cameras
+from univoxel.color import linear_to_srgb
+from univoxel.core.records import Surface
 from univoxel.envmap import EnvMap
 from univoxel.fields.field import dense_field
 from univoxel.fields.grid import fit_grid
@@ -65,6 +68,26 @@ def lopsided(voxels: int = 48**3, change=None, light=None) -> Scene:
     scene = Scene(cfg, field, inv_s=100.0)
     scene.material = Identity()
     return scene.eval()
+
+
+def looking(azimuth: float, elevation: float, size: int, focal: float) -> Cameras:
+    """A camera in the distance that looks at the object; its focal length in widths."""
+    phi, up = math.radians(azimuth), math.radians(elevation)
+    back = torch.tensor([math.cos(up) * math.cos(phi), math.cos(up) * math.sin(phi), math.sin(up)])
+    right = torch.tensor([-math.sin(phi), math.cos(phi), 0.0])
+    position = torch.tensor([0.08, 0.0, 0.08]) + 3.0 * back
+    pose = torch.stack([right, torch.linalg.cross(back, right), back, position], -1)[None]
+    return Cameras(pose, torch.full((1, 2), focal * size), torch.full((1, 2), size / 2), size, size)
+
+
+def layers_of(surface: Surface) -> dict[str, torch.Tensor]:
+    """What a picture of each of its layers shows of it."""
+    return {
+        "albedo": linear_to_srgb(surface.albedo),
+        "roughness": surface.roughness[:, None].expand(-1, 3),
+        "metal": surface.metallic[:, None].expand(-1, 3),
+        "normal": 0.5 * surface.normal + 0.5,
+    }
 
 
 def with_metal() -> Scene:

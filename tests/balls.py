@@ -7,18 +7,19 @@ from univoxel import sphere
 from univoxel.core.records import Surface
 
 
+def surface_at(position, normal, albedo=0.5, roughness=0.5, **others):
+    """One material all over, and a feature of zeros; opaque, and seen from a distance of 1."""
+    n = len(position)
+    values = {"albedo": albedo * torch.ones(n, 3), "roughness": roughness * torch.ones(n)}
+    values |= {"features": torch.zeros(n, 1), "opacity": torch.ones(n), "depth": torch.ones(n)}
+    return Surface(position, normal, **(values | others))
+
+
 def ball(n=200, features=4, albedo=0.5, roughness=0.5, seed=0):
     g = torch.Generator().manual_seed(seed)
     normal = sphere.fibonacci_sphere(n)
-    return Surface(
-        position=normal,
-        normal=normal,
-        features=torch.randn(n, features, generator=g),
-        albedo=torch.full((n, 3), albedo),
-        roughness=torch.full((n,), roughness),
-        opacity=torch.ones(n),
-        depth=torch.ones(n),
-    )
+    features = torch.randn(n, features, generator=g)
+    return surface_at(normal, normal, albedo, roughness, features=features)
 
 
 def views(surface, seed=1):

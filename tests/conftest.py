@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from analytic import write_scene
 from tiny import tiny, tiny_copy  # noqa: F401
 
 from univoxel.data import load_images
@@ -20,6 +21,12 @@ _SOURCES = hashlib.sha256(b"".join(path.read_bytes() for path in _OPS)).hexdiges
 _KIND = f"{torch.__version__}-{torch.backends.cpu.get_cpu_capability()}-{_SOURCES}"
 _FOLDER = Path(tempfile.gettempdir()) / f"univoxel-tests-inductor-{_USER}-{_KIND}"
 os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(_FOLDER))
+
+
+@pytest.fixture(scope="session")
+def data(tmp_path_factory):
+    """A small data set of the sphere, which no test changes."""
+    return write_scene(tmp_path_factory.mktemp("sphere") / "data", views=8, size=24)
 
 
 @pytest.fixture

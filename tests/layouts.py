@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from analytic import look_at
+from PIL import ExifTags, Image
 from scipy.spatial.transform import Rotation
 
 from univoxel.data import load_photos
@@ -296,6 +297,13 @@ def write_tensoir(folder: Path, scene: Scene) -> Path:
             }
             (view / "metadata.json").write_text(json.dumps(meta))
     return folder
+
+
+def save_turned(path: Path, picture: np.ndarray, tag: int) -> None:
+    """A JPEG file whose EXIF says how it is to be turned."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = tag
+    Image.fromarray(picture).save(path, exif=exif, quality=100, subsampling=0)
 
 
 def replaced(file: str, *changes: tuple[str, str]) -> Callable[[Path], None]:

@@ -157,9 +157,7 @@ def sphere_of(base, metallic, roughness, views=12, noise=0.0):
     """A scene with the map known and the material not, and photographs of a sphere [COUNT]."""
     torch.manual_seed(1)
     map = lamps(NODES)
-    scene = scene_of((0.5, 0.5, 0.5), 0.5, NODES)
-    with torch.no_grad():
-        scene.sky.log_radiance.copy_(map.log())
+    scene = scene_of((0.5, 0.5, 0.5), 0.5, NODES, map)
     problem = problem_on_a_sphere(COUNT, views, NODES, scene)
     metallic = (
         metallic(problem.observations.normal)

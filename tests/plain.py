@@ -7,6 +7,8 @@ import pytest
 from univoxel.cli import trainer
 from univoxel.config import StageConfig, TrainConfig
 from univoxel.fields.grid import GridShape
+from univoxel.lights import SGConfig
+from univoxel.scene import SceneConfig
 
 # On dense grids, with rates for few steps; no patches, and no physically based render unless asked
 plain_stage = partial(
@@ -28,6 +30,16 @@ plain_training = partial(
     detail="none",
     carving_seconds=0.0,
     capacity="fixed",
+)
+
+
+# Networks that are trained in a moment
+small_scene = partial(
+    SceneConfig,
+    channels=4,
+    material_channels=2,
+    hidden=16,
+    light=SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64),
 )
 
 

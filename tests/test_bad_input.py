@@ -88,16 +88,23 @@ def test_a_number_where_a_path_is_wanted(run, tmp_path, refused):
     refused(r"ends in .*\.ply.*, got 42", "export", run, "--mesh", 42)
 
 
-def another_version(path):
-    with safe_open(path, "pt") as file:
-        meta = json.loads(file.metadata()["univoxel"])
-    save_file(load_file(path), path, {"univoxel": json.dumps(meta | {"format": 99})})
+def meta(change):
+    def apply(path):
+        with safe_open(path, "pt") as file:
+            meta = json.loads(file.metadata()["univoxel"])
+        change(meta)
+        save_file(load_file(path), path, {"univoxel": json.dumps(meta)})
+
+    return apply
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (another_version, r"scene\.safetensors: expected checkpoint format \d+, got 99"),
+        (
+            meta(lambda m: m.update(format=99)),
+            r"scene\.safetensors: expected checkpoint format \d+, got 99",
+        ),
         (lambda p: save_file(load_file(p), p), r"expected checkpoint format \d+, got None"),
         (lambda p: p.write_bytes(p.read_bytes()[:-9]), r"scene\.safetensors: damaged or truncated"),
         (lambda p: p.write_bytes(b""), r"scene\.safetensors: damaged or truncated"),
@@ -123,16 +130,6 @@ def test_a_run_that_was_killed_before_its_first_checkpoint(run, data, capsys):
     assert f"{run}: nothing has been saved yet" in capsys.readouterr().out
     assert (run / FILE).is_file()
     assert "gone" not in ((run / "log.jsonl").read_text() if (run / "log.jsonl").exists() else "")
-
-
-def meta(change):
-    def apply(path):
-        with safe_open(path, "pt") as file:
-            meta = json.loads(file.metadata()["univoxel"])
-        change(meta)
-        save_file(load_file(path), path, {"univoxel": json.dumps(meta)})
-
-    return apply
 
 
 def edited_tensor(name, change):

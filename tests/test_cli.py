@@ -14,12 +14,15 @@ from operator import attrgetter
 from pathlib import Path
 
 import pytest
+import torch
 from plain import plain_stage, plain_training
 
 import univoxel
 from univoxel import cli, errors
+from univoxel.capture.config import DEFAULTS, FAST
 from univoxel.cli import COMMANDS, LABORATORY, SPINS, laboratory, main, take_threads
 from univoxel.cli.parsing import meanings, takes
+from univoxel.config import save_config
 from univoxel.errors import ExistingFile, MissingExtra, MissingFile, ProcessFailed, UserError
 from univoxel.presets import chosen
 
@@ -148,8 +151,6 @@ def test_capture(calls, capsys):
 
 
 def test_train_as_another_run_was_trained(calls, tmp_path, capsys):
-    from univoxel.config import save_config
-
     (tmp_path / "before").mkdir()
     stages = (plain_stage(voxels=1.0, iterations=10, share=1.0),)
     before = plain_training(Path("cup"), tmp_path / "before", stages, 1.0, downscale=2, seed=3)
@@ -177,8 +178,6 @@ def test_train_as_another_run_was_trained(calls, tmp_path, capsys):
 
 
 def test_poses(calls, capsys):
-    from univoxel.capture.config import DEFAULTS, FAST
-
     assert main(["poses", "photos", "--out", "scene"]) == 0
     options = ["--masks", "m", "--every", "0.5", "--keep-size", "900", "--keep-weak", "--fast"]
     more = ["--size", "800", "--seed", "3"]
@@ -573,27 +572,20 @@ def test_verbose_says_when(capsys, calls):
     assert all(float(line.split()[0]) >= 0 for line in [*out[:-1], *err])
 
 
-def test_threads(calls, monkeypatch):
-    import torch
-
-    monkeypatch.setenv("OMP_NUM_THREADS", "7")
-    before = torch.get_num_threads()
-    try:
-        assert main(["info", "run", "--threads", "1"]) == 0
-        assert os.environ["OMP_NUM_THREADS"] == "1"
-        assert torch.get_num_threads() == 1
-    finally:
-        torch.set_num_threads(before)
-
-
 @pytest.fixture
 def torch_threads():
     """How many threads torch has; it has them again after the test."""
-    import torch
-
     before = torch.get_num_threads()
     yield before
     torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("torch_threads")
+def test_threads(calls, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    assert main(["info", "run", "--threads", "1"]) == 0
+    assert os.environ["OMP_NUM_THREADS"] == "1"
+    assert torch.get_num_threads() == 1
 
 
 @pytest.mark.parametrize(
@@ -604,8 +596,6 @@ def test_a_container_of_few_cores_gets_few_threads(
     granted, asked, threads, monkeypatch, torch_threads
 ):
     """Of a machine of eight cores, of which a control group grants so many."""
-    import torch
-
     monkeypatch.setattr("univoxel.core.system.usable_cores", lambda: 8)
     monkeypatch.setattr("univoxel.core.machine.cores", lambda: granted)
     monkeypatch.setenv("OMP_NUM_THREADS", asked or "")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from analytic import cameras_around, sphere_normals, write_scene
+from layouts import edited
 from PIL import Image
 from tiny import CHANGES
 
@@ -50,13 +51,7 @@ def colored(value):
 
 
 def first_views(count):
-    def apply(data: Path):
-        path = data / "transforms_train.json"
-        transforms = json.loads(path.read_text())
-        transforms["frames"] = transforms["frames"][:count]
-        path.write_text(json.dumps(transforms))
-
-    return apply
+    return edited("transforms_train.json", lambda t: t.update(frames=t["frames"][:count]))
 
 
 def mirror(picture, cameras, view):
@@ -88,12 +83,13 @@ def one_pixel(picture, cameras, view):
 def cut_off(data: Path):
     """Twice the focal length: the object leaves the pictures on all sides."""
     every_picture(lambda p, *_: p[4:12, 4:12].repeat(2, 0).repeat(2, 1))(data)
-    for split in ("train", "test"):
-        path = data / f"transforms_{split}.json"
-        transforms = json.loads(path.read_text())
+
+    def change(transforms):
         half = math.tan(transforms["camera_angle_x"] / 2) / 2
         transforms["camera_angle_x"] = 2 * math.atan(half)
-        path.write_text(json.dumps(transforms))
+
+    for split in ("train", "test"):
+        edited(f"transforms_{split}.json", change)(data)
 
 
 def half_cut_off(picture, cameras, view):
@@ -104,10 +100,9 @@ def half_cut_off(picture, cameras, view):
 def on_the_axis(data: Path):
     """The one pixel of each picture lies on its optical axis: together they see one small thing."""
     every_picture(one_pixel)(data)
+    centre = {"cx": SIZE / 2 + 0.5, "cy": SIZE / 2 + 0.5}
     for split in ("train", "test"):
-        path = data / f"transforms_{split}.json"
-        text = json.loads(path.read_text()) | {"cx": SIZE / 2 + 0.5, "cy": SIZE / 2 + 0.5}
-        path.write_text(json.dumps(text))
+        edited(f"transforms_{split}.json", lambda root: root.update(centre))(data)
 
 
 CASES = {

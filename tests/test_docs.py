@@ -15,6 +15,8 @@ import doc_truth
 import doc_words
 import pytest
 
+import univoxel
+
 ROOT = Path(__file__).parent.parent
 
 
@@ -228,8 +230,6 @@ def test_a_promise_that_a_page_does_not_keep_is_found(tmp_path):
 
 
 def test_every_public_name_has_a_section():
-    import univoxel
-
     text = doc_python.python()
     public = [name for name in univoxel.__all__ if f"### univoxel.{name}\n" not in text]
     assert public == ["Cancelled", "Run", "TrainingProgress", "UserError"]  # have other sections

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import torch
 from asymmetric_scene import albedo, lopsided
+from balls import surface_at
 from integrator_scenes import WHITE, octahedron, sphere_points
 from PIL import Image
 
 from univoxel import brdf
 from univoxel.camera import Cameras
 from univoxel.cli import export as task
-from univoxel.core.records import Mesh, Surface
+from univoxel.core.records import Mesh
 from univoxel.envmap import EnvMap, lookup, tables
 from univoxel.ops import VisibilityScene
 from univoxel.render import relight
@@ -47,17 +48,7 @@ def smooth_map(height=32):
 
 def a_sphere(n, metallic, roughness):
     normal, wo = sphere_points(n, seed=3, facing=0.5)
-    surface = Surface(
-        position=normal,
-        normal=normal,
-        features=torch.zeros(n, 1),
-        albedo=BASE.expand(n, 3),
-        roughness=torch.full((n,), roughness),
-        opacity=torch.ones(n),
-        depth=torch.ones(n),
-        metallic=metallic,
-    )
-    return surface, wo
+    return surface_at(normal, normal, BASE, roughness, metallic=metallic), wo
 
 
 def test_a_base_colour_is_split_as_gltf_says():

@@ -7,6 +7,7 @@ import math
 import os
 import subprocess
 import sys
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -311,10 +312,7 @@ def test_a_copy_traces_for_itself():
 def test_a_failed_write_keeps_the_checkpoint_before(tmp_path, monkeypatch):
     save_scene(small_scene(), tmp_path, {"step": 1})
 
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "replace", full)
+    monkeypatch.setattr(os, "replace", Mock(side_effect=OSError(28, "No space left on device")))
     with pytest.raises(OSError, match=r"scene.safetensors: cannot write .* No space left"):
         save_scene(small_scene(), tmp_path, {"step": 2})
     monkeypatch.undo()

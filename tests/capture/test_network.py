@@ -5,6 +5,7 @@ import sys
 import types
 from pathlib import Path
 from typing import get_args
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -136,10 +137,7 @@ def test_rembg_goes_first(home, monkeypatch, caplog):
     assert not module.mask_network("u2net")(photograph()).any()
     assert len(caplog.messages) == 1
 
-    def offline(_):
-        raise ConnectionError("no network")
-
-    made.new_session = offline
+    made.new_session = Mock(side_effect=ConnectionError("no network"))
     with pytest.raises(DataError, match=r"could not download the weights of u2netp: no network"):
         module.mask_network()
 

@@ -22,6 +22,7 @@ from univoxel.capture import model as database
 from univoxel.capture import poses as poses_task
 from univoxel.capture import sfm, structure
 from univoxel.capture.config import CaptureConfig
+from univoxel.capture.model import NO_POINT, read_model
 from univoxel.capture.photographs import find_photographs
 from univoxel.capture.poses import poses
 from univoxel.capture.prepare import Folders, gather
@@ -167,8 +168,6 @@ def test_what_is_left_out_is_named(scene):
 def test_the_model_holds_together(scene):
     """What the pictures see of the points is where the cameras project them."""
     out, _ = scene
-    from univoxel.capture.model import NO_POINT, read_model
-
     model = read_model(out / "sparse/0")
     position = dict(zip(model.points.number.tolist(), model.points.position, strict=True))
     for image in model.images:

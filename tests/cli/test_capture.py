@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import capturing
 import numpy as np
@@ -20,7 +21,14 @@ from PIL import Image
 import univoxel
 from univoxel.capture import poses as structure_from_motion
 from univoxel.cli import capture as task
-from univoxel.errors import DataError, ExistingFile, MissingExtra, StillBackground, UserError
+from univoxel.errors import (
+    DataError,
+    ExistingFile,
+    MissingExtra,
+    StillBackground,
+    UserError,
+    WithoutMasks,
+)
 
 USUAL = ("u2netp", None, False)  # of options of cutout
 VIEWS = 11  # of 36 around the object: too few for a vote, so masks are taken as they are
@@ -258,8 +266,11 @@ def steps(monkeypatch, tmp_path) -> list[tuple]:
     return noted
 
 
-def no_network(*_):
-    raise MissingExtra("making masks with a network needs rembg: pip install 'univoxel[masks]'")
+no_network = Mock(
+    side_effect=MissingExtra(
+        "making masks with a network needs rembg: pip install 'univoxel[masks]'"
+    )
+)
 
 
 def red_is_the_object(*_):
@@ -303,10 +314,7 @@ def test_masks_of_ones_own_go_on(steps, pictures, tmp_path):
     assert "31.25" in page
 
 
-def without_masks(*_, **__):
-    from univoxel.errors import WithoutMasks
-
-    raise WithoutMasks("none")
+without_masks = Mock(side_effect=WithoutMasks("none"))
 
 
 def test_another_network_makes_other_masks(steps, pictures, tmp_path, monkeypatch):
@@ -387,8 +395,9 @@ def test_a_capture_of_version_0_2_is_gone_on_with(steps, pictures, tmp_path):
     assert [name for name, *_ in steps] == ["poses", "cutout", "train"]
 
 
-def still(photographs, out, masks=None, config=None):
-    raise StillBackground("the background is static in 9 of 10 pairs of photographs")
+still = Mock(
+    side_effect=StillBackground("the background is static in 9 of 10 pairs of photographs")
+)
 
 
 def test_a_turntable_gets_masks_first(steps, pictures, tmp_path, monkeypatch, caplog):
@@ -511,10 +520,7 @@ def test_how_long_training_takes_is_said_before_cameras_are_found(
 ):
     caplog.set_level("INFO", "univoxel")
 
-    def stop(*_):
-        raise DataError("no cameras")
-
-    monkeypatch.setattr(task, "_find_cameras", stop)
+    monkeypatch.setattr(task, "_find_cameras", Mock(side_effect=DataError("no cameras")))
     with pytest.raises(DataError, match="no cameras"):
         task.capture(photographs[0], tmp_path / "out", masks=photographs[1], preset="draft")
     assert re.search(

@@ -4,6 +4,7 @@ import html
 import logging
 import sys
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -42,12 +43,9 @@ def by_brightness(monkeypatch):
 def test_what_cannot_be_written_leaves_nothing_behind_that_looks_whole(
     tmp_path, monkeypatch, by_brightness
 ):
-    def full(*_):
-        raise OSError("no space left")
-
     data, out = write_scene(tmp_path / "data", 3, 8), tmp_path / "cut"
     with monkeypatch.context() as patch:
-        patch.setattr(task, "write_cameras", full)
+        patch.setattr(task, "write_cameras", Mock(side_effect=OSError("no space left")))
         with pytest.raises(OSError, match="no space left"):
             task.cutout(data, out)
     assert not out.exists()

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -19,15 +20,9 @@ GIB = 1 << 30
 GOOD = native.NativeStatus(True, "avx2", None, ("avx2", "default"), ("default", "avx2"), 4)
 
 
-class WithoutEmbree:
-    @staticmethod
-    def embree_version():
-        return 0
-
-
 @pytest.fixture
 def without_embree(monkeypatch):
-    monkeypatch.setattr(native, "core", WithoutEmbree)
+    monkeypatch.setattr(native, "core", SimpleNamespace(embree_version=lambda: 0))
 
 
 def by_name(findings):

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import rich
 import torch
+from balls import surface_at
 from torch import nn
 
 from univoxel.cli import evaluate as task
 from univoxel.color import linear_to_srgb, srgb_to_linear
-from univoxel.core.records import Mesh, Surface
+from univoxel.core.records import Mesh
 from univoxel.data import load_photos
 from univoxel.data.images import read_exr, read_image, write_png
 from univoxel.errors import DataError
@@ -90,17 +91,11 @@ def relit_calls(monkeypatch):
 
     def surface_of_view(scene, cameras, view, albedo_near=None):
         mask = inside().flatten()
-        n = len(mask)
-        angle = math.radians(TILT)
-        surface = Surface(
-            position=torch.zeros(n, 3),
-            normal=torch.tensor([math.sin(angle), 0.0, math.cos(angle)]).expand(n, 3),
-            features=torch.zeros(n, 1),
-            albedo=true_albedo(view).reshape(-1, 3) / SCALE,
-            roughness=torch.full((n,), ROUGHNESS),
-            opacity=mask.float(),
-            depth=torch.full((n,), 4.0),
-        )
+        n, angle = len(mask), math.radians(TILT)
+        normal = torch.tensor([math.sin(angle), 0.0, math.cos(angle)]).expand(n, 3)
+        albedo = true_albedo(view).reshape(-1, 3) / SCALE
+        at = {"opacity": mask.float(), "depth": torch.full((n,), 4.0)}
+        surface = surface_at(torch.zeros(n, 3), normal, albedo, ROUGHNESS, **at)
         wo = torch.tensor([0.6, 0.0, 0.8]).expand(n, 3)
         return surface, wo
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from unittest.mock import Mock
 
 import pytest
 from analytic import write_scene
@@ -101,10 +102,7 @@ def test_a_run_that_cannot_begin_leaves_nothing(tmp_path, large):
 def test_the_disk_may_be_full(tmp_path, large, monkeypatch, caplog):
     caplog.set_level("INFO", "univoxel")
 
-    def full(*_):
-        raise OSError(28, "no space left")
-
-    monkeypatch.setattr(image_cache, "save_file", full)
+    monkeypatch.setattr(image_cache, "save_file", Mock(side_effect=OSError(28, "no space left")))
     run = train(config(tmp_path))
     assert "prepared photographs could not be stored" in caplog.text
     assert load_photos(tmp_path / "data").downscale == 2

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from analytic import LIGHTS, RADIUS, cameras_around, write_scene
-from plain import interrupt_second_stage, plain_stage, plain_training
+from plain import interrupt_second_stage, plain_stage, plain_training, small_scene
 
 from lab.stress.damage import turned
 from univoxel.camera import project
@@ -17,11 +17,10 @@ from univoxel.config import TrainConfig
 from univoxel.data import load_photos
 from univoxel.data.transforms import write_cameras
 from univoxel.evaluation.confidence import survey
-from univoxel.lights import SGConfig
 from univoxel.preparation import pose_refinement
 from univoxel.preparation.prepare import find_silhouettes
 from univoxel.render.pipeline import extract_mesh
-from univoxel.scene import SceneConfig, load_scene
+from univoxel.scene import load_scene
 
 
 @pytest.fixture(scope="module")
@@ -36,15 +35,12 @@ def data(tmp_path_factory):
 
 
 def config(data, out, cameras="auto") -> TrainConfig:
-    light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
     stages = (
         plain_stage(voxels=0.01, iterations=80, share=0.5, rays=256),
         plain_stage(voxels=0.02, iterations=80, share=0.5, rays=256, physical_from=0.5),
     )
-    scene = SceneConfig(channels=4, material_channels=2, hidden=16, light=light)
-    return plain_training(
-        data, out, stages, minutes=2.0, cameras=cameras, scene=scene, voxel_pixels=0.0
-    )
+    options = {"cameras": cameras, "scene": small_scene(), "voxel_pixels": 0.0}
+    return plain_training(data, out, stages, minutes=2.0, **options)
 
 
 @pytest.fixture(scope="module")

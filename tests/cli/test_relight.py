@@ -6,11 +6,12 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from balls import surface_at
 
 from univoxel.camera import image_rays, project
 from univoxel.cli import relight as task
 from univoxel.color import linear_to_srgb
-from univoxel.core.records import Mesh, Surface
+from univoxel.core.records import Mesh
 from univoxel.data.images import read_exr, read_image, write_exr
 from univoxel.envmap import EnvMap
 from univoxel.errors import DataError
@@ -41,22 +42,14 @@ def surface_of_view(scene, cameras, view, albedo_near=None):
     met = hit.face >= 0
     depth = torch.where(met, hit.t, 0.0)
     position = rays.origin + depth[:, None] * rays.direction
-    n = len(depth)
-    surface = Surface(
-        position=position,
-        normal=torch.nn.functional.normalize(position, dim=1),
-        features=torch.zeros(n, 1),
-        albedo=torch.full((n, 3), ALBEDO),
-        roughness=torch.full((n,), 0.7),
-        opacity=met.float(),
-        depth=depth,
-    )
+    normal = torch.nn.functional.normalize(position, dim=1)
+    surface = surface_at(position, normal, ALBEDO, 0.7, opacity=met.float(), depth=depth)
     return surface, -rays.direction
 
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
-    """A run whose data has two test cameras at +X and +Y, and two maps beside it."""
+    """A run whose data has two test cameras at +X and +Y, and three maps beside it."""
     scene = SimpleNamespace(field=SimpleNamespace(voxel_size=0.02))
     monkeypatch.setattr(viewpoints, "load_scene", lambda run: scene)
     monkeypatch.setattr(viewpoints, "extract_mesh", lambda scene: sphere())
@@ -69,9 +62,10 @@ def run(tmp_path, monkeypatch):
     cameras = {"camera_angle_x": 0.7, "w": SIZE, "h": SIZE, "frames": frames}
     (tmp_path / "cameras.json").write_text(json.dumps(cameras))
     (tmp_path / "run").mkdir()
-    white = torch.ones(4, 8)
-    write_exr(tmp_path / "white.exr", {c: white for c in "RGB"})
-    write_exr(tmp_path / "dim.exr", {c: 0.25 * white for c in "RGB"})
+    white, sun = torch.ones(4, 8), torch.zeros(16, 32)
+    sun[7:9, 15:17] = 50.0  # at +X
+    for name, radiance in (("white", white), ("dim", 0.25 * white), ("sun", sun)):
+        write_exr(tmp_path / f"{name}.exr", dict.fromkeys("RGB", radiance))
     return tmp_path
 
 
@@ -123,9 +117,6 @@ def frames_sum(run):
 
 def test_rotation_moves_the_light(run):
     """A sun at +X lights the view from +X; turned by 90 degrees it lights the one from +Y."""
-    sun = torch.zeros(16, 32)
-    sun[7:9, 15:17] = 50.0
-    write_exr(run / "sun.exr", {c: sun for c in "RGB"})
     lit = []
     for rotate in (0.0, 90.0):
         frames(run, out=f"turned{rotate}", maps="sun", rotate=rotate)
@@ -224,9 +215,6 @@ def test_bad_maps_and_cameras_name_the_file(run):
 
 
 def test_light_turns_under_a_still_camera(run):
-    sun = torch.zeros(16, 32)
-    sun[7:9, 15:17] = 50.0
-    write_exr(run / "sun.exr", {c: sun for c in "RGB"})
     names = frames(run, maps="sun", turn=4, animation=["gif"])
     assert names == ["animation.gif", *(f"turn_{i:04d}.{s}" for i in range(4)
                                         for s in ("exr", "png"))]  # fmt: skip

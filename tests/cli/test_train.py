@@ -8,7 +8,7 @@ import pytest
 import torch
 from analytic import LIGHTS, RADIUS, photos_of, sphere_scene, write_scene
 from layouts import Scene, write_colmap
-from plain import interrupt_second_stage, plain_stage, plain_training
+from plain import interrupt_second_stage, plain_stage, plain_training, small_scene
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
@@ -20,13 +20,12 @@ from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.config import TrainConfig, save_config
 from univoxel.data import load_photos
 from univoxel.data.images import read_image, write_png
-from univoxel.lights import SGConfig
 from univoxel.preparation import prepare as preparation
 from univoxel.presets import with_field
 from univoxel.render.pipeline import extract_mesh
 from univoxel.run import load_verdict
 from univoxel.run import photos_of as photos_of_run
-from univoxel.scene import FILE, SceneConfig, load_scene
+from univoxel.scene import FILE, load_scene
 from univoxel.training import clock, descent, loop
 from univoxel.training.pixels import split_pixels
 
@@ -37,18 +36,11 @@ def data(tmp_path_factory):
 
 
 def config(data, out, **changes) -> TrainConfig:
-    light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
     stages = (
         plain_stage(voxels=0.01, iterations=60, share=0.5, rays=256),
         plain_stage(voxels=0.03, iterations=80, share=0.5, rays=256, physical_from=0.0),
     )
-    cfg = plain_training(
-        data,
-        out,
-        stages,
-        minutes=2.0,
-        scene=SceneConfig(channels=4, material_channels=2, hidden=16, light=light),
-    )
+    cfg = plain_training(data, out, stages, minutes=2.0, scene=small_scene())
     # The pictures are 32 pixels wide
     return dataclasses.replace(cfg, **{"voxel_pixels": 0.0} | changes)
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from analytic import cameras_around, hull_of, scene_of, sphere_scene
+from balls import surface_at
 from observed_points import (
     BLUE,
     RED,
@@ -18,7 +19,6 @@ from observed_points import (
 
 from univoxel.color import linear_to_srgb, srgb_to_linear
 from univoxel.config import JointConfig
-from univoxel.core.records import Surface
 from univoxel.errors import ConfigError, DataError
 from univoxel.lights import EnvmapConfig
 from univoxel.lights.views import Table, Turntable, resampling, rotated
@@ -160,9 +160,7 @@ def test_a_turntable_without_an_axis(photographs):
 
 def test_the_equations_see_the_map_as_the_renders_do():
     """Newton's linear transport against the shading of observations, map by map."""
-    scene = turning(scene_of((0.5, 0.4, 0.3), 0.4, NODES))
-    with torch.no_grad():
-        scene.sky.log_radiance.copy_(lamps(NODES).log())
+    scene = turning(scene_of((0.5, 0.4, 0.3), 0.4, NODES, lamps(NODES)))
     problem = problem_on_a_sphere(20, 4, NODES, scene)
     eye = cameras_around(VIEWS).camera_to_world[:4, :, 3]
     problem = replace(problem, observations=replace(problem.observations, eye=eye))
@@ -236,13 +234,11 @@ def test_both_renders_follow_the_camera():
         rotated(turn.transpose(1, 2), x) for x in (here, here)
     )  # as the first camera sees it
     depth = torch.full((VIEWS,), 2.0)
-    surface = Surface(
-        position=eye - depth[:, None] * wo,
-        normal=normal,
+    surface = surface_at(
+        eye - depth[:, None] * wo,
+        normal,
+        roughness=0.3,
         features=torch.zeros(VIEWS, 4),
-        albedo=torch.full((VIEWS, 3), 0.5),
-        roughness=torch.full((VIEWS,), 0.3),
-        opacity=torch.ones(VIEWS),
         depth=depth,
     )
     still = sphere_scene(NODES).eval()

@@ -18,7 +18,7 @@ from observed_points import (
     problem_on_a_sphere,
     random_problem,
 )
-from plain import plain_stage, plain_training
+from plain import plain_stage, plain_training, small_scene
 from tiny import OPTIONS
 
 from univoxel.cli import main
@@ -28,11 +28,10 @@ from univoxel.color import linear_to_srgb_unclipped
 from univoxel.config import JointConfig
 from univoxel.data import load_photos
 from univoxel.data.images import read_image
-from univoxel.lights import SGConfig
 from univoxel.preparation import prepare
 from univoxel.render.observations import prefiltered_roughness, shade_observations
 from univoxel.render.pipeline import extract_mesh
-from univoxel.scene import Scene, SceneConfig, load_checkpoint, load_scene, save_scene
+from univoxel.scene import Scene, load_checkpoint, load_scene, save_scene
 from univoxel.training import equations, joint_solve, newton
 from univoxel.training.loop import held_out_psnr
 from univoxel.training.newton import newton_round_
@@ -175,17 +174,15 @@ def test_solve_finds_gains_and_the_albedo_under_them():
 
 def test_training_explains_exposures(tmp_path):
     data = write_scene(tmp_path / "data", gain=2 ** stops(12, 1.5))
-    light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
     stages = (
         plain_stage(voxels=0.01, iterations=40, share=0.5, rays=256),
         plain_stage(voxels=0.03, iterations=60, share=0.5, rays=256, physical_from=0.0),
     )
-    sizes = SceneConfig(channels=4, material_channels=2, hidden=16, light=light)
     photos = load_photos(data, "train")
     pixels = torch.cartesian_prod(torch.arange(12), torch.arange(32), torch.arange(32))
     found = {}
     for varying in ("none", "exposure", "light"):
-        scene, run = replace(sizes, varying=varying), tmp_path / varying
+        scene, run = small_scene(varying=varying), tmp_path / varying
         learned = load_scene(train(plain_training(data, run, stages, minutes=2.0, scene=scene)))
         assert learned.cfg.varying == varying
         assert learned.cfg.views == (() if varying == "none" else tuple(photos.names))

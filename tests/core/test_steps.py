@@ -1,6 +1,7 @@
 """What is noted of steps, and what is refused."""
 
 import os
+from unittest.mock import Mock
 
 import pytest
 
@@ -33,11 +34,8 @@ def test_another_fingerprint_is_refused(tmp_path):
 def test_a_killed_writer_leaves_the_steps_before(tmp_path, monkeypatch):
     files.finish(tmp_path, "cut", 1)
 
-    def killed(*_):
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patch:
-        patch.setattr(os, "replace", killed)
+        patch.setattr(os, "replace", Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             files.finish(tmp_path, "sewn", 2)
     assert files.done(tmp_path, "cut", 1)

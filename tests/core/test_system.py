@@ -10,11 +10,14 @@ import sys
 import time
 import types
 from pathlib import Path
+from unittest.mock import Mock
 
 import psutil
 import pytest
 
 from univoxel.core import system
+from univoxel.data.load_images import check_name
+from univoxel.data.transforms import view_names
 from univoxel.errors import DataError
 
 
@@ -54,11 +57,12 @@ def test_room_is_taken_on_the_disk(each, tmp_path):
 
 
 def test_a_full_disk_is_an_error_on_macos(tmp_path, monkeypatch):
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
     monkeypatch.setattr(sys, "platform", "darwin")
-    monkeypatch.setitem(sys.modules, "fcntl", types.SimpleNamespace(fcntl=full))
+    monkeypatch.setitem(
+        sys.modules,
+        "fcntl",
+        types.SimpleNamespace(fcntl=Mock(side_effect=OSError(28, "No space left on device"))),
+    )
     with (tmp_path / "room").open("wb") as file:
         with pytest.raises(OSError, match="No space"):
             system.reserve(file.fileno(), 1 << 20)
@@ -110,12 +114,9 @@ def test_a_file_that_is_open_elsewhere_is_replaced_later(each, tmp_path, monkeyp
 
 
 def test_a_file_that_stays_open_elsewhere_is_an_error(tmp_path, monkeypatch):
-    def replace(source, target):
-        raise PermissionError(13, "sharing violation")
-
     monkeypatch.setattr(sys, "platform", "win32")
     monkeypatch.setattr(system, "REPLACED_WITHIN", 0.2)
-    monkeypatch.setattr(os, "replace", replace)
+    monkeypatch.setattr(os, "replace", Mock(side_effect=PermissionError(13, "sharing violation")))
     with pytest.raises(PermissionError, match="sharing"):
         system.replace(tmp_path / "new", tmp_path / "old")
 
@@ -137,9 +138,6 @@ def test_names_that_every_system_has(name, each):
 
 
 def test_views_whose_pictures_would_be_one_file(monkeypatch):
-    from univoxel.data.load_images import check_name
-    from univoxel.data.transforms import view_names
-
     files = ["left/A.png", "right/a.png"]
     assert view_names(files) == ["A", "a"]
     monkeypatch.setattr(sys, "platform", "darwin")

@@ -3,11 +3,12 @@
 import json
 import math
 import threading
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from layouts import refused
+from layouts import edited, refused
 
 from univoxel.data import load_photos
 from univoxel.data.images import write_exr, write_png
@@ -22,8 +23,8 @@ def pose(angle=0.3):
     return [[c, -s, 0.0, 1.0], [s, c, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
 
 
-def rgba(seed=0, width=WIDTH):
-    return np.random.default_rng(seed).integers(1, 256, (HEIGHT, width, 4), dtype=np.uint8)
+def rgba(seed=0):
+    return np.random.default_rng(seed).integers(1, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8)
 
 
 @pytest.fixture
@@ -43,15 +44,7 @@ def save(folder, transforms, split="train"):
     (folder / f"transforms_{split}.json").write_text(json.dumps(transforms))
 
 
-def load(folder):
-    return json.loads((folder / "transforms_train.json").read_text())
-
-
-def edit(folder, change):
-    """Apply a change to the parsed transforms file."""
-    transforms = load(folder)
-    change(transforms)
-    save(folder, transforms)
+edit = partial(edited, "transforms_train.json")
 
 
 def test_photos_and_cameras(scene):
@@ -76,7 +69,7 @@ def test_names_with_extension_and_with_dots(scene):
         transforms["frames"][0]["file_path"] = "train/r_0.png"
         transforms["frames"][1]["file_path"] = "train/r_1.5"
 
-    edit(scene, change)
+    edit(change)(scene)
     assert load_photos(scene).names == ["r_0", "r_1.5"]
 
 
@@ -86,14 +79,14 @@ def test_intrinsics_in_pixels(scene):
         transforms.update(fl_x=7.0, fl_y=8.0, cx=2.5, cy=1.5, w=WIDTH, h=HEIGHT, k1=0.0)
         transforms["frames"][1]["fl_x"] = 9.0
 
-    edit(scene, change)
+    edit(change)(scene)
     cameras = load_photos(scene).cameras
     assert cameras.focal.tolist() == [[7.0, 8.0], [9.0, 8.0]]
     assert cameras.centre.tolist() == [[2.5, 1.5]] * 2
 
 
 def test_one_focal_length_serves_both_axes(scene):
-    edit(scene, lambda t: t.update(fl_x=7.0))
+    root(fl_x=7.0)(scene)
     assert load_photos(scene).cameras.focal.tolist() == [[7.0, 7.0]] * 2
 
 
@@ -104,7 +97,7 @@ def test_rounded_matrices_become_rotations(scene):
         transforms["frames"][0]["transform_matrix"] = matrix.tolist()
         transforms["frames"][1]["transform_matrix"] = matrix[:3].tolist()
 
-    edit(scene, change)
+    edit(change)(scene)
     for matrix in load_photos(scene).cameras.camera_to_world:
         torch.testing.assert_close(matrix, torch.tensor(pose(0.3))[:3])
 
@@ -168,24 +161,19 @@ def matrix(change):
     """An edit of the first frame's matrix."""
 
     def apply(folder):
-        m = np.array(pose())
-        m = change(m)
-        edit(
-            folder,
-            lambda t: t["frames"][0].update(
-                transform_matrix=m.tolist() if isinstance(m, np.ndarray) else m
-            ),
-        )
+        m = change(np.array(pose()))
+        m = m.tolist() if isinstance(m, np.ndarray) else m
+        edit(lambda t: t["frames"][0].update(transform_matrix=m))(folder)
 
     return apply
 
 
 def frame(**values):
-    return lambda folder: edit(folder, lambda t: t["frames"][1].update(values))
+    return edit(lambda t: t["frames"][1].update(values))
 
 
 def root(**values):
-    return lambda folder: edit(folder, lambda t: t.update(values))
+    return edit(lambda t: t.update(values))
 
 
 def text(content):
@@ -278,7 +266,7 @@ BROKEN = {
     "mirrored": (matrix(lambda m: m * [-1, 1, 1, 1]), "frame 0: expected a rotation .* reflection"),
     "transposed": (matrix(lambda m: m.T), "frame 0: transform_matrix must end with 0 0 0 1"),
     "no angle": (
-        lambda f: edit(f, lambda t: t.pop("camera_angle_x")),
+        edit(lambda t: t.pop("camera_angle_x")),
         "frame 0: expected camera_angle_x between 0 and 3.142, got nothing",
     ),
     "angle in degrees": (root(camera_angle_x=40.0), "camera_angle_x between 0 and 3.142, got 40.0"),

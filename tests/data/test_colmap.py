@@ -3,11 +3,12 @@
 import struct
 import subprocess
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from layouts import HEIGHT, WIDTH, refused, scene, write_colmap
+from layouts import HEIGHT, WIDTH, refused, replaced, scene, write_colmap
 
 from univoxel.data import load_photos
 from univoxel.data.images import write_png
@@ -55,17 +56,15 @@ def test_photographs_in_folders_and_names_with_spaces(tmp_path):
         for v in range(2):
             path = tmp_path / part / f"p_00{v}{ending}"
             path.rename(tmp_path / part / "a b" / f"p {v}{ending}")
-    path = tmp_path / "sparse" / "0" / "images.txt"
-    path.write_text(path.read_text().replace("p_00", "a b/p "))
+    images(("p_00", "a b/p "))(tmp_path)
     assert load_photos(tmp_path, "test").names == ["a b_p 0"]
 
 
-def edited(name, change):
-    def apply(folder):
-        path = folder / "sparse" / "0" / name
-        path.write_text(change(path.read_text()))
+cameras, images = (partial(replaced, f"sparse/0/{name}.txt") for name in ("cameras", "images"))
 
-    return apply
+
+def other_text(text):
+    return lambda folder: (folder / "sparse/0/images.txt").write_text(text)
 
 
 def cut(name, keep):
@@ -83,32 +82,26 @@ def other_size(wider, higher):
 
 TEXT = {
     "fisheye": (
-        edited("cameras.txt", lambda t: t.replace("SIMPLE_PINHOLE", "OPENCV_FISHEYE")),
+        cameras(("SIMPLE_PINHOLE", "OPENCV_FISHEYE")),
         r"cameras\.txt: expected .* SIMPLE_PINHOLE, .*, got OPENCV_FISHEYE for camera 3: run",
     ),
     "parameters": (
-        edited("cameras.txt", lambda t: t.replace("SIMPLE_PINHOLE", "PINHOLE")),
+        cameras(("SIMPLE_PINHOLE", "PINHOLE")),
         r"cameras\.txt: this file .*: camera 3: 3 parameters do not fit PINHOLE",
     ),
-    "words": (
-        edited("cameras.txt", lambda t: t.replace("11.0", "wide")),
-        r"cameras\.txt: this file .* 'wide'",
-    ),
+    "words": (cameras(("11.0", "wide")), r"cameras\.txt: this file .* 'wide'"),
     "focal length": (
-        edited("cameras.txt", lambda t: t.replace("11.0", "-11.0")),
+        cameras(("11.0", "-11.0")),
         r"cameras\.txt: .*: expected focal lengths from 0\.006 to 1\.2e\+06 pixels .*, got -11",
     ),
     "camera": (
-        edited("images.txt", lambda t: t.replace(" 3 p_004", " 9 p_004")),
+        images((" 3 p_004", " 9 p_004")),
         r"images\.txt: p_004\.png refers to missing camera 9",
     ),
-    "line": (
-        edited("images.txt", lambda t: t.replace(" 3 p_004.png", "")),
-        r"images\.txt: this file of a COLMAP model",
-    ),
-    "nothing": (edited("images.txt", lambda t: "# none\n"), r"images\.txt: expected photographs w"),
+    "line": (images((" 3 p_004.png", "")), r"images\.txt: this file of a COLMAP model"),
+    "nothing": (other_text("# none\n"), r"images\.txt: expected photographs w"),
     "quaternion": (
-        edited("images.txt", lambda t: "1 0 0 0 0 1 2 3 3 p_000.png\n"),
+        other_text("1 0 0 0 0 1 2 3 3 p_000.png\n"),
         r"images\.txt: .* the pose of p_000\.png is",
     ),
     "no picture": (

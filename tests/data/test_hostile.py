@@ -1,13 +1,21 @@
 """Data sets that nobody made by mistake: numbers beyond all range, files of others, bombs."""
 
-import json
 import struct
-from pathlib import Path
+from functools import partial
+from unittest.mock import Mock
 
 import layouts
 import numpy as np
 import pytest
-from layouts import scene, write_colmap, write_nerf, write_nerfstudio, write_tensoir
+from layouts import (
+    edited,
+    replaced,
+    scene,
+    write_colmap,
+    write_nerf,
+    write_nerfstudio,
+    write_tensoir,
+)
 
 from univoxel.core.files import read_json
 from univoxel.data import load_cameras, load_photos
@@ -17,10 +25,8 @@ from univoxel.errors import DataError
 GIANT = 10**400  # float() raises OverflowError
 
 
-def edit(path: Path, change) -> None:
-    root = json.loads(path.read_text())
-    change(root)
-    path.write_text(json.dumps(root))
+edit = partial(edited, "transforms.json")
+cameras, images = (partial(replaced, f"sparse/0/{name}.txt") for name in ("cameras", "images"))
 
 
 @pytest.fixture
@@ -52,13 +58,13 @@ def moved(place: object):
     ],
 )
 def test_numbers_that_no_camera_has(data, change, message):
-    edit(data / "transforms.json", change)
+    edit(change)(data)
     with pytest.raises(DataError, match=rf"transforms\.json: .*{message}"):
         load_photos(data)
 
 
 def test_a_camera_path_is_as_small_as_files_hold(data):
-    edit(data / "transforms.json", lambda r: r.update(w=10**9))
+    edit(lambda r: r.update(w=10**9))(data)
     with pytest.raises(DataError, match=r"expected w between 0 and 6.554e\+04, got 1000000000"):
         load_cameras(data / "transforms.json", 64)
 
@@ -66,12 +72,10 @@ def test_a_camera_path_is_as_small_as_files_hold(data):
 @pytest.mark.parametrize("number", ["9" * 400, "1e-320", "1e39"])
 def test_numbers_of_colmap(tmp_path, number):
     folder = write_colmap(tmp_path, scene(), text=True)
-    path = folder / "sparse/0/cameras.txt"
-    text = path.read_text()
-    path.write_text(text.replace("11.0", number))
+    cameras(("11.0", number))(folder)
     with pytest.raises(DataError, match=r"cameras\.txt: .*(focal lengths|values \[inf)"):
         load_photos(folder)
-    path.write_text(text.replace(" 12 ", f" {10**400} "))
+    cameras((number, "11.0"), (" 12 ", f" {10**400} "))(folder)
     with pytest.raises(DataError, match=r"cameras\.txt: this file of a COLMAP model"):
         load_photos(folder)
 
@@ -114,18 +118,15 @@ def test_a_byte_order_mark_is_no_fault(data):
 def test_names_come_before_pictures(data, tmp_path, monkeypatch, layout):
     """120,000 frames of one name took two minutes: each picture was opened."""
 
-    def opened(*_):
-        raise AssertionError("a picture was opened")
-
+    opened = Mock(side_effect=AssertionError("a picture was opened"))
     monkeypatch.setattr("univoxel.data.transforms.image_size", opened)
     monkeypatch.setattr("univoxel.data.colmap.image_size", opened)
     if layout == "nerf":
-        edit(data / "transforms.json", lambda r: r.update(frames=r["frames"][:1] * 9))
+        edit(lambda r: r.update(frames=r["frames"][:1] * 9))(data)
         message = r"frame 1: the name p_009 of images/p_009\.png occurs twice"
     else:
         data = write_colmap(tmp_path / "colmap", scene(), text=True)
-        path = data / "sparse/0/images.txt"
-        path.write_text(path.read_text().replace("p_003.png", "p_004.png"))
+        images(("p_003.png", "p_004.png"))(data)
         message = r"images\.txt: expected unique, non-empty image names, got 'p_004\.png'"
     with pytest.raises(DataError, match=message):
         load_photos(data)
@@ -161,7 +162,7 @@ def test_paths_out_of_the_folder(data, tmp_path, monkeypatch, key, absolute):
     elsewhere = tmp_path / "p_009.png"
     write_png(elsewhere, np.full((8, 12, 4), 200, np.uint8))
     named = str(elsewhere) if absolute else "../p_009.png"
-    edit(data / "transforms.json", lambda r: r["frames"][0].update({key: named}))
+    edit(lambda r: r["frames"][0].update({key: named}))(data)
     with pytest.raises(
         DataError, match=r"frame 0: expected files inside .*data, got .*p_009\.png"
     ) as e:
@@ -170,15 +171,14 @@ def test_paths_out_of_the_folder(data, tmp_path, monkeypatch, key, absolute):
     assert len(load_photos(data, allow_outside=True)) == 8
     inside = "masks/../images/p_009.png" if key == "file_path" else "images/../mask.png"
     write_png(data / "mask.png", np.full((8, 12), 255, np.uint8))
-    edit(data / "transforms.json", lambda r: r["frames"][0].update({key: inside}))
+    edit(lambda r: r["frames"][0].update({key: inside}))(data)
     assert len(load_photos(data)) == 8
 
 
 def test_names_of_colmap_out_of_the_folder(tmp_path):
     data = write_colmap(tmp_path / "data", scene(), text=True)
     (data / "images" / "p_004.png").rename(tmp_path / "p_004.png")
-    path = data / "sparse/0/images.txt"
-    path.write_text(path.read_text().replace("p_004.png", "../../p_004.png"))
+    images(("p_004.png", "../../p_004.png"))(data)
     with pytest.raises(DataError, match=r"images\.txt: expected files inside .*data, .*p_004\.png"):
         load_photos(data)
 
@@ -209,7 +209,7 @@ def test_cameras_that_are_a_link_out_of_the_folder(tmp_path, layout):
 )
 def test_names_that_mean_another_folder(data, file_path, file, name):
     """Results are written under the names of views: `relight` wrote OUT.png beside OUT."""
-    edit(data / "transforms.json", lambda r: r["frames"][1].update(file_path=file_path))
+    edit(lambda r: r["frames"][1].update(file_path=file_path))(data)
     (data / "images" / "p_008.png").rename(data / file)
     message = f"frame 1: expected a name that is valid as a file name, got '{name}'"
     with pytest.raises(DataError, match=message):
@@ -221,7 +221,7 @@ def test_names_that_mean_another_folder(data, file_path, file, name):
 @pytest.mark.parametrize("file_path", ["../../x.png", "/tmp/x", "a/../../x.exr"])
 def test_names_of_views_are_those_of_files(data, file_path):
     """Whatever folders stand before them."""
-    edit(data / "transforms.json", lambda r: r["frames"][1].update(file_path=file_path))
+    edit(lambda r: r["frames"][1].update(file_path=file_path))(data)
     names, _ = load_cameras(data / "transforms.json", 64)
     assert names[1] == "x"
 
@@ -234,6 +234,5 @@ def test_folders_in_names_of_colmap_become_part_of_them(tmp_path):
     if mask.exists():
         (data / "masks" / "left").mkdir()
         mask.rename(data / "masks" / "left" / mask.name)
-    path = data / "sparse/0/images.txt"
-    path.write_text(path.read_text().replace("p_004.png", "left/../left/p_004.png"))
+    images(("p_004.png", "left/../left/p_004.png"))(data)
     assert load_photos(data, "test").names[0] == "left_.._left_p_004"

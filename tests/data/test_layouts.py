@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from univoxel.camera import image_rays, project
 from univoxel.core.records import Mesh
 from univoxel.data import load_photos
+from univoxel.data.images import write_png
 from univoxel.errors import DataError
 from univoxel.output.viewpoints import views_of
 from univoxel.run import load_world, save_world
@@ -190,8 +191,6 @@ def test_splits_that_cannot_be_made(tmp_path, writer):
 
 
 def test_masks_may_be_alpha_too(tmp_path):
-    from univoxel.data.images import write_png
-
     written = scene()
     write_colmap(tmp_path, written)
     for v, name in enumerate(written.names):

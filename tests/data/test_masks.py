@@ -7,6 +7,7 @@ import pytest
 import torch
 from analytic import write_scene
 from layouts import (
+    save_turned,
     scene,
     write_colmap,
     write_idr,
@@ -17,7 +18,7 @@ from layouts import (
     write_polycam,
     write_realitycapture,
 )
-from PIL import ExifTags, Image
+from PIL import Image
 
 from univoxel.data import load_photos
 from univoxel.data.images import (
@@ -393,11 +394,9 @@ def test_faint_masks_are_refused(lit):
 
 
 def turned_photograph(path, upright, tag):
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = tag
     stored = stored_from_upright(torch.from_numpy(upright), tag).contiguous().numpy()
     path.parent.mkdir(exist_ok=True)
-    Image.fromarray(stored).save(path, exif=exif, quality=100, subsampling=0)
+    save_turned(path, stored, tag)
 
 
 @pytest.mark.parametrize("tag", range(1, 9))

@@ -1,11 +1,12 @@
 """Photographs are read at once and in bands, and kept: nothing tells from the result."""
 
 import os
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
-from layouts import HEIGHT, WIDTH, scene, write_nerf, write_nerfstudio
+from layouts import HEIGHT, WIDTH, replaced, scene, write_nerf, write_nerfstudio
 from PIL import Image
 from safetensors import safe_open
 
@@ -44,17 +45,12 @@ def test_readers_and_bands_do_not_matter(tmp_path, monkeypatch, downscale, bent)
 
 def test_pixels_are_decoded_in_bands(data, monkeypatch):
     """No more of a large photograph at once than the constant says, in linear light."""
-    rows = []
-    linear = load_images._premultiplied
-
-    def noted(color, alpha):
-        rows.append(len(color))
-        return linear(color, alpha)
-
-    monkeypatch.setattr(load_images, "_premultiplied", noted)
+    linear = Mock(wraps=load_images._premultiplied)
+    monkeypatch.setattr(load_images, "_premultiplied", linear)
     monkeypatch.setattr(load_images, "BAND", 8 * 37)
     written = write_nerfstudio(data.parent / "plain", scene(3, width=37, height=29))
     load_photos(written, downscale=2)
+    rows = [len(call.args[0]) for call in linear.call_args_list]
     assert max(rows) == 8
     assert sum(rows) == 2 * 28  # the row that is left over is cut off
 
@@ -155,9 +151,7 @@ def other_mask(data):
     write_png(data / "masks" / "p_001.png", np.full((29, 37), 255, np.uint8))
 
 
-def another_lens(data):
-    file = data / "transforms.json"
-    file.write_text(file.read_text().replace('"p2": 0.01', '"p2": 0.02'))
+another_lens = replaced("transforms.json", ('"p2": 0.01', '"p2": 0.02'))
 
 
 @pytest.mark.parametrize("change", [touched, other_mask, another_lens])

@@ -6,8 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from layouts import FOCAL, HEIGHT, WIDTH, scene, write_colmap, write_nerfstudio
-from PIL import ExifTags, Image
+from layouts import (
+    FOCAL,
+    HEIGHT,
+    WIDTH,
+    replaced,
+    save_turned,
+    scene,
+    write_colmap,
+    write_nerfstudio,
+)
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from univoxel.camera import project
@@ -100,24 +109,17 @@ def test_cameras_without_pictures_may_differ_in_size(tmp_path):
         load_cameras(path, 8)
 
 
-def save_turned(path, picture, tag):
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = tag
-    Image.fromarray(picture).save(path, exif=exif, quality=100, subsampling=0)
-
-
 @pytest.fixture
 def turned(tmp_path, written):
     """A COLMAP model of JPEG files that say that they are to be turned."""
     write_colmap(tmp_path, written, text=True)
-    images = tmp_path / "sparse/0/images.txt"
     for v, name in enumerate(written.names):
         (tmp_path / "images" / f"{name}.png").unlink()
         gray = np.full((HEIGHT, WIDTH, 3), 20 * v, np.uint8)
         gray[:4] += 50
         save_turned(tmp_path / "images" / f"{name}.jpg", gray, 6)
         (tmp_path / "masks" / f"{name}.png.png").rename(tmp_path / "masks" / f"{name}.jpg.png")
-    images.write_text(images.read_text().replace(".png", ".jpg"))
+    replaced("sparse/0/images.txt", (".png", ".jpg"))(tmp_path)
     return tmp_path
 
 
@@ -132,8 +134,7 @@ def test_pixels_are_those_of_the_file(turned):
 def test_messages_say_that_pixels_are_not_turned(turned):
     """Cameras of photographs as viewers show them."""
     note = "; the EXIF orientation 6 of p_001"
-    cameras = turned / "sparse/0/cameras.txt"
-    cameras.write_text(cameras.read_text().replace(f"{WIDTH} {HEIGHT}", f"{HEIGHT} {WIDTH}"))
+    replaced("sparse/0/cameras.txt", (f"{WIDTH} {HEIGHT}", f"{HEIGHT} {WIDTH}"))(turned)
     with pytest.raises(DataError, match=r"expected 8x12 pixels.*, got 12x8; the EXIF .* 6"):
         load_photos(turned)
     frames = [{"file_path": "images/p_001.jpg", "transform_matrix": np.eye(4).tolist()}]

@@ -1,9 +1,7 @@
 """TensoIR-Synthetic: which pictures are trained on, and errors."""
 
-import json
-
 import pytest
-from layouts import refused, scene, write_tensoir
+from layouts import edited, refused, scene, write_tensoir
 
 from univoxel.data import load_photos
 from univoxel.errors import DataError
@@ -39,11 +37,7 @@ def test_nerfactors_name(data):
 
 
 def meta(**values):
-    def apply(folder):
-        path = folder / "train_001" / "metadata.json"
-        path.write_text(json.dumps(json.loads(path.read_text()) | values))
-
-    return apply
+    return edited("train_001/metadata.json", lambda root: root.update(values))
 
 
 def two_lights(folder):

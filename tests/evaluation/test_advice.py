@@ -18,10 +18,7 @@ EVERY = replace(confidence.ADVICE, least=0.0)
 
 @pytest.fixture(scope="module")
 def scene():
-    scene = scene_of(RED, 0.4, NODES)
-    with torch.no_grad():
-        scene.sky.log_radiance.copy_(lamps(NODES).log())
-    return scene
+    return scene_of(RED, 0.4, NODES, lamps(NODES))
 
 
 @pytest.fixture(scope="module")

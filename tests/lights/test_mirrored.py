@@ -1,6 +1,7 @@
 """The network of what is mirrored sharply."""
 
 import torch
+from balls import surface_at
 from torch.nn.functional import normalize
 
 from univoxel import brdf
@@ -15,18 +16,8 @@ def mirror_ball(n: int, metallic: float) -> tuple[Surface, torch.Tensor]:
     """Points of a ball of radius 1, and unit directions to the eye on their side."""
     normal = normalize(torch.randn(n, 3), dim=1)
     wo = normalize(normal + 0.7 * normalize(torch.randn(n, 3), dim=1), dim=1)
-    ones = torch.ones(n)
-    surface = Surface(
-        position=normal,
-        normal=normal,
-        features=torch.zeros(n, 2),
-        albedo=torch.ones(n, 3),
-        roughness=0.1 * ones,
-        opacity=ones,
-        depth=ones,
-        metallic=metallic * ones,
-    )
-    return surface, wo
+    material = {"albedo": 1.0, "roughness": 0.1, "metallic": metallic * torch.ones(n)}
+    return surface_at(normal, normal, features=torch.zeros(n, 2), **material), wo
 
 
 def test_adds_nothing_at_first():

@@ -59,7 +59,7 @@ def test_lobes_are_in_range_and_finite():
 
 def test_recovers_a_known_light():
     """A ball of known material under one coloured lobe: the fit renders it and finds the light."""
-    surface = dataclasses.replace(ball(300), roughness=torch.full((300,), 0.25))
+    surface = ball(300, roughness=0.25)
     wo = views(surface)
     axis = torch.nn.functional.normalize(torch.tensor([[0.5, -0.3, 0.8]]), dim=-1)
     truth = (axis.expand(300, 1, 3), torch.full((300, 1), 8.0), torch.ones(300, 1, 3))

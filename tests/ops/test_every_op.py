@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import torch
+from check_op import same_on_threads
 from op_cases import (
     CASES,
     CHANGED,
@@ -390,16 +391,8 @@ def test_strides_and_offsets_of_storage_change_nothing(case):
 @pytest.mark.parametrize("case", CASES)
 def test_the_bits_do_not_depend_on_the_number_of_threads(case):
     """With more work than one chunk."""
-    before, given, runs = torch.get_num_threads(), CASES[case](3000), []
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            runs.append(results(case, given))
-    finally:
-        torch.set_num_threads(before)
-    for other in runs[1:]:
-        for a, b in zip(runs[0], other, strict=True):
-            assert torch.equal(a, b)
+    given = CASES[case](3000)
+    same_on_threads(lambda: results(case, given))
 
 
 @pytest.mark.skipif(native.core is None, reason="there is nothing to compare")

@@ -97,9 +97,7 @@ def test_direct_light_equals_quadrature(strategy, blocked):
         samples=65536, strategy=strategy, offset=0.0 if blocked else 0.01,
     )  # fmt: skip
     # One strategy alone is noisy where the other is good; none is off by more than its noise.
-    assert (got - wanted).norm() / wanted.norm() < {"mis": 0.003, "map": 0.01, "brdf": 0.01}[
-        strategy
-    ]
+    assert (got - wanted).norm() / wanted.norm() < (0.003 if strategy == "mis" else 0.01)
 
 
 def test_error_falls_with_samples():
@@ -144,14 +142,9 @@ def test_both_sides_reflect():
     torch.testing.assert_close(*results)
 
 
-def test_no_points_and_strided_points():
-    mesh, scene = octahedron()
+def test_no_points():
     none = torch.empty(0, 3)
-    assert shade(mesh, scene, WHITE, none, none).shape == (0, 3)
-    normal, wo = sphere_points(10)
-    wide = normal.repeat(1, 2)[:, :3]
-    assert not wide.is_contiguous()
-    assert torch.equal(shade(mesh, scene, WHITE, wide, wo), shade(mesh, scene, WHITE, normal, wo))
+    assert shade(*octahedron(), WHITE, none, none).shape == (0, 3)
 
 
 def test_there_is_no_reference():

@@ -22,15 +22,20 @@ def random_rays(n, dtype=torch.float64, seed=0):
     return origin, direction, torch.rand(n, generator=g, dtype=dtype)
 
 
+def marched(sdf, voxel, rays, inv_s, **options):
+    least, place = brick_minimum(sdf), ((-1.0,) * 3, voxel)
+    return march(sdf, least, *rays, *place, step=voxel, inv_s=inv_s, **options)
+
+
 @pytest.mark.parametrize("inv_s", [10.0, 60.0])
 def test_native_equals_reference(inv_s):
     sdf, voxel = sphere()
     rays = random_rays(500)
-    options = {"step": voxel, "inv_s": inv_s}
     # Skipping leaves out transmittance above sigmoid(8), so weights at the threshold may differ.
     # A threshold that no section is near to makes the comparison exact.
-    got = march(sdf, brick_minimum(sdf), *rays, (-1.0,) * 3, voxel, **options, min_weight=1e-3)
-    want = march_reference(sdf, *rays, (-1.0,) * 3, voxel, **options, min_weight=1e-3)
+    options = {"inv_s": inv_s, "min_weight": 1e-3}
+    got = marched(sdf, voxel, rays, **options)
+    want = march_reference(sdf, *rays, (-1.0,) * 3, voxel, step=voxel, **options)
     assert torch.equal(got.offsets, want.offsets)
     torch.testing.assert_close(got.t, want.t)
     assert torch.equal(got.connected, want.connected)
@@ -79,17 +84,7 @@ def test_brick_minimum_of_another_grid():
 def test_samples_stand_around_the_surface():
     sdf, voxel = sphere(48)
     origin, direction, jitter = random_rays(200)
-    samples = march(
-        sdf,
-        brick_minimum(sdf),
-        origin,
-        direction,
-        jitter,
-        (-1.0,) * 3,
-        voxel,
-        step=voxel,
-        inv_s=4 / voxel,
-    )
+    samples = marched(sdf, voxel, (origin, direction, jitter), inv_s=4 / voxel)
     # Distance along the ray to the analytic sphere
     b = (origin * direction).sum(1)
     disc = b**2 - (origin.square().sum(1) - 0.36)
@@ -106,9 +101,7 @@ def test_samples_stand_around_the_surface():
 
 def test_last_sample_of_a_ray_starts_no_section():
     sdf, voxel = sphere()
-    s = march(
-        sdf, brick_minimum(sdf), *random_rays(100), (-1.0,) * 3, voxel, step=voxel, inv_s=30.0
-    )
+    s = marched(sdf, voxel, random_rays(100), inv_s=30.0)
     ends = s.offsets[1:][s.offsets.diff() > 0] - 1
     assert not s.connected[ends].any()
     gaps = s.t.diff()[s.connected[:-1]]
@@ -127,15 +120,5 @@ def test_rays_that_miss_or_are_not_numbers_have_no_samples():
     sdf, voxel = sphere(dtype=torch.float32)
     origin = torch.tensor([[5.0, 5.0, 5.0], [0.0, 0.0, 3.0], [float("nan"), 0.1, 0.0]])
     direction = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.6, 0.0, 0.8]])
-    s = march(
-        sdf,
-        brick_minimum(sdf),
-        origin,
-        direction,
-        torch.zeros(3),
-        (-1.0,) * 3,
-        voxel,
-        step=voxel,
-        inv_s=30.0,
-    )
+    s = marched(sdf, voxel, (origin, direction, torch.zeros(3)), inv_s=30.0)
     assert s.offsets.tolist() == [0, 0, 0, 0]

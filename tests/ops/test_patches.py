@@ -3,7 +3,9 @@
 import math
 
 import torch
+from analytic import look_at
 from check_op import check_op
+from torch.nn.functional import normalize
 
 from univoxel.camera import Cameras, projection_matrices
 from univoxel.ops import patch_correlation, patch_correlation_reference
@@ -13,17 +15,11 @@ SIZE, FOCAL = 48, 60.0
 
 def cameras(views=4):
     """On a circle about the origin, 3 away, looking at it."""
-    poses = []
-    for k in range(views):
-        angle = torch.tensor(0.35 * k)
-        back = torch.stack([angle.cos(), angle.sin(), torch.tensor(0.3)])
-        back = back / back.norm()
-        right = torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0]), back)
-        right = right / right.norm()
-        up = torch.linalg.cross(back, right)
-        poses.append(torch.stack([right, up, back, 3 * back], 1))
+    angle = 0.35 * torch.arange(views)
+    away = torch.stack([angle.cos(), angle.sin(), torch.full_like(angle, 0.3)], 1)
+    poses = torch.stack([look_at(p) for p in 3 * normalize(away, dim=1)])
     lens = torch.full((views, 2), FOCAL), torch.full((views, 2), SIZE / 2)
-    return Cameras(torch.stack(poses), *lens, SIZE, SIZE)
+    return Cameras(poses, *lens, SIZE, SIZE)
 
 
 def rays_of(known, view, row, column):

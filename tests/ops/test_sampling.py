@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from check_op import same_on_threads
 from op_cases import CASES, LEAVES, doubled, flat, fresh, function, projection
 from torch import Tensor
 
@@ -49,16 +50,10 @@ def test_sparse_gradients_are_the_dense_ones(case, backend):
 @pytest.mark.skipif(native.core is None, reason="without the extension")
 @pytest.mark.parametrize("case", SAMPLERS)
 def test_bits_of_sparse_gradients_do_not_depend_on_the_number_of_threads(case):
-    given, threads, runs = CASES[case](3000), torch.get_num_threads(), []
-    try:
-        for count in (1, 2, 3):
-            torch.set_num_threads(count)
-            runs.append(gradients(case, given, sparse_grad=True))
-    finally:
-        torch.set_num_threads(threads)
-    for other in runs[1:]:
-        for name, wanted in runs[0].items():
-            assert torch.equal(other[name].to_dense(), wanted.to_dense())
+    given = CASES[case](3000)
+    same_on_threads(
+        lambda: [g.to_dense() for g in gradients(case, given, sparse_grad=True).values()]
+    )
 
 
 @pytest.mark.parametrize("sparse", [False, True])

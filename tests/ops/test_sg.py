@@ -3,39 +3,26 @@
 import math
 
 import torch
-from check_op import check_op
+from check_op import SHADING_RTOL, check_op, uniform, unit
 
 from univoxel import sphere
 from univoxel.ops import shade_sg, shade_sg_reference
 
-# Above check_op's common bound: a few hundred directions through exp of -60 .. 0, whose argument is
-# a difference of terms up to 30, and D's denominator at low roughness.
-RTOL = {torch.float32: 1e-4, torch.float64: 1e-12}
-
-
-def unit(g, *shape):
-    x = torch.randn(*shape, 3, generator=g, dtype=torch.float64)
-    return torch.nn.functional.normalize(x, dim=-1)
-
 
 def points(n, lobes, count, seed=0, roughness=(0.2, 1.0), f0=0.04):
     g = torch.Generator().manual_seed(seed)
-
-    def uniform(low, high, *shape):
-        return low + (high - low) * torch.rand(*shape, generator=g, dtype=torch.float64)
-
     normal = unit(g, n)
     tensors = [
         unit(g, n, lobes),
-        uniform(0.1, 30, n, lobes),
-        uniform(0, 2, n, lobes, 3),
+        uniform(g, 0.1, 30, n, lobes),
+        uniform(g, 0, 2, n, lobes, 3),
         normal,
         torch.nn.functional.normalize(normal + 0.8 * unit(g, n), dim=-1),
-        uniform(0, 1, n, 3),
-        uniform(*roughness, n),
+        uniform(g, 0, 1, n, 3),
+        uniform(g, *roughness, n),
     ]
     directions = sphere.fibonacci_hemisphere(count, torch.float64)
-    return *[t.requires_grad_() for t in tensors], directions, uniform(0, 6.28, n), f0
+    return *[t.requires_grad_() for t in tensors], directions, uniform(g, 0, 6.28, n), f0
 
 
 def test_native_equals_reference():
@@ -46,14 +33,12 @@ def test_native_equals_reference():
         points(0, 3, 16),
         points(4, 2, 64, roughness=(0.05, 0.2), f0=0.0),
     ]
-    check_op(shade_sg, shade_sg_reference, cases, rtol=RTOL)
+    check_op(shade_sg, shade_sg_reference, cases, rtol=SHADING_RTOL)
 
 
 def metals(case, seed=1):
     """The same points with an F0 per channel, black and white among them."""
-    f0 = torch.rand(
-        len(case[3]), 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)
-    )
+    f0 = uniform(torch.Generator().manual_seed(seed), 0, 1, len(case[3]), 3)
     f0[:1, 0], f0[:1, 1] = 0, 1
     return *case[:9], f0.requires_grad_()
 
@@ -68,7 +53,7 @@ def test_metals_native_equals_reference():
     behind = list(metals(points(3, 2, 20)))
     behind[4] = (-behind[4].detach()).requires_grad_()
     behind[7] = sphere.fibonacci_sphere(20, torch.float64)
-    check_op(shade_sg, shade_sg_reference, [*cases, tuple(behind)], rtol=RTOL)
+    check_op(shade_sg, shade_sg_reference, [*cases, tuple(behind)], rtol=SHADING_RTOL)
 
 
 def test_diffuse_under_a_wide_lobe():

@@ -4,24 +4,11 @@ import math
 
 import pytest
 import torch
-from check_op import check_op
+from check_op import SHADING_RTOL, check_op, uniform, unit
 
 from univoxel import sphere
 from univoxel.ops import shade_map, shade_map_reference, shade_radiance, shade_radiance_reference
 from univoxel.ops.shade import _shade_radiance
-
-# Above check_op's common bound: sums of a few hundred directions, and D's denominator at low
-# roughness.
-RTOL = {torch.float32: 1e-4, torch.float64: 1e-12}
-
-
-def unit(g, *shape):
-    x = torch.randn(*shape, 3, generator=g, dtype=torch.float64)
-    return torch.nn.functional.normalize(x, dim=-1)
-
-
-def uniform(g, low, high, *shape):
-    return low + (high - low) * torch.rand(*shape, generator=g, dtype=torch.float64)
 
 
 def surface(g, n, count, roughness=(0.2, 1.0)):
@@ -81,7 +68,7 @@ def in_halves(op):
 
 def test_radiance_native_equals_reference():
     cases = [lit(3, 37), lit(1, 1, f0=0.5), lit(0, 16), lit(4, 64, roughness=(0.05, 0.2), f0=0.0)]
-    check_op(shade_radiance, shade_radiance_reference, cases, RTOL)
+    check_op(shade_radiance, shade_radiance_reference, cases, SHADING_RTOL)
 
 
 def test_map_native_equals_reference():
@@ -91,10 +78,12 @@ def test_map_native_equals_reference():
         mapped(0, 16, points=0),
         mapped(4, 64, roughness=(0.05, 0.2), f0=0.0),
     ]
-    check_op(shade_map, shade_map_reference, cases, RTOL)
-    check_op(in_halves(shade_map), in_halves(shade_map_reference), cases[:1], RTOL)
+    check_op(shade_map, shade_map_reference, cases, SHADING_RTOL)
+    check_op(in_halves(shade_map), in_halves(shade_map_reference), cases[:1], SHADING_RTOL)
     map, visibility, *rest = mapped(6, 37)
-    check_op(shade_map, shade_map_reference, [(map, visibility.double() / 255, *rest)], RTOL)
+    check_op(
+        shade_map, shade_map_reference, [(map, visibility.double() / 255, *rest)], SHADING_RTOL
+    )
 
 
 @pytest.mark.parametrize("f0", ["number", "per channel"])
@@ -109,7 +98,7 @@ def test_normals_and_metals_native_equals_reference(f0):
         cases = [metals(c) for c in (*cases, tuple(behind))]
         if f0 == "number":
             cases = [(*c[:-1], 0.3) for c in cases]
-        check_op(for_unit_normals(op, at), for_unit_normals(reference, at), cases, RTOL)
+        check_op(for_unit_normals(op, at), for_unit_normals(reference, at), cases, SHADING_RTOL)
 
 
 def test_gradient_to_the_normal_takes_it_as_any_vector():

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from bricks import cut
-from check_op import check_op, grads_of
+from check_op import check_op, grads_of, same_on_threads
 
 from univoxel.core.records import Bricks
 from univoxel.ops import sample_dense, sample_sparse, sample_sparse_reference
@@ -75,22 +75,14 @@ def test_the_same_as_the_dense_grid_it_stands_for(shape):
         torch.testing.assert_close(a, b)
     wanted, rows = grads_of(sample_dense, dense), arguments[2].grid_rows()
     stored = rows >= 128
-    threads = torch.get_num_threads()
-    for sparse in (False, True):
-        got = []
-        for n in (1, 2, 3):
-            torch.set_num_threads(n)
-            grads = grads_of(sample_sparse, arguments, sparse_grad=sparse)
-            got.append([g.to_dense() for g in grads])
-        torch.set_num_threads(threads)
-        assert not got[0][0][:128].any()
-        assert not got[0][1][:128].any()
+    for options in ({}, {"sparse_grad": True}):
+        got = same_on_threads(
+            lambda o=options: [g.to_dense() for g in grads_of(sample_sparse, arguments, **o)]
+        )
         for k in (0, 1):
-            torch.testing.assert_close(got[0][k][rows][stored], wanted[k][stored])
-        torch.testing.assert_close(got[0][2], wanted[2])
-        for a, b, c in zip(*got, strict=True):
-            assert torch.equal(a, b)
-            assert torch.equal(a, c)
+            assert not got[k][:128].any()
+            torch.testing.assert_close(got[k][rows][stored], wanted[k][stored])
+        torch.testing.assert_close(got[2], wanted[2])
 
 
 def test_sparse_rows_are_the_touched_ones():

@@ -1,9 +1,11 @@
 """Rays against triangles: Embree against brute force, closed forms."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
+from op_cases import soup, through_triangles
 
 from univoxel import ops
 
@@ -11,26 +13,16 @@ TRIANGLE = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 FACE = torch.tensor([[0, 1, 2]], dtype=torch.int32)
 
 
-def soup(n=200, seed=0):
-    """Random triangles in the unit cube: nothing closed, nothing ordered."""
-    g = torch.Generator().manual_seed(seed)
-    centre = torch.rand(n, 1, 3, generator=g)
-    corner = centre + 0.2 * torch.randn(n, 3, 3, generator=g)
-    return corner.reshape(-1, 3), torch.arange(3 * n, dtype=torch.int32).reshape(n, 3)
-
-
-def rays(n=2000, seed=1):
-    g = torch.Generator().manual_seed(seed)
-    direction = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=1)
-    return torch.rand(n, 3, generator=g), direction
+def rays(n=2000):
+    return tuple(through_triangles(n).values())
 
 
 @pytest.mark.parametrize("interval", [(0.0, math.inf), (0.1, 0.4)])
 def test_native_equals_brute_force(interval):
-    scene = ops.VisibilityScene(*soup())
+    scene = ops.VisibilityScene(*soup(200))
     got, wanted = (
         scene.closest_hit(*rays(), *interval),
-        ops.closest_hit_reference(*soup(), *rays(), *interval),
+        ops.closest_hit_reference(*soup(200), *rays(), *interval),
     )
     assert 0.1 < (wanted.face >= 0).float().mean() < 0.95
     # Rays that graze an edge or the ends of the interval may fall on either side in float32.
@@ -78,18 +70,15 @@ def test_closed_mesh_lets_no_ray_through():
     assert ops.VisibilityScene(vertices, faces).occluded(origin, target - origin).all()
 
 
-def test_strided_rays_and_wide_faces():
-    vertices, faces = soup()
+def test_strided_vertices_and_wide_faces():
+    vertices, faces = soup(200)
     scene = ops.VisibilityScene(vertices.repeat(1, 2)[:, :3], faces.long())
-    origin, direction = rays()
-    strided = origin.repeat(1, 2)[:, :3], direction.t().contiguous().t()
-    assert not strided[0].is_contiguous()
-    assert torch.equal(scene.occluded(*strided), scene.occluded(origin, direction))
+    assert torch.equal(scene.occluded(*rays()), ops.VisibilityScene(*soup(200)).occluded(*rays()))
 
 
 def test_no_rays_and_no_triangles():
     none = torch.empty(0, 3)
-    scene = ops.VisibilityScene(*soup())
+    scene = ops.VisibilityScene(*soup(200))
     assert scene.occluded(none, none).shape == (0,)
     assert scene.closest_hit(none, none).barycentric.shape == (0, 2)
     for empty in (
@@ -131,16 +120,11 @@ def test_the_mesh_is_copied():
 
 
 def test_without_embree_the_error_says_how_to_get_it(monkeypatch):
-    class Core:
-        @staticmethod
-        def embree_version():
-            return 0
-
-    monkeypatch.setattr(ops.native, "core", Core)
+    monkeypatch.setattr(ops.native, "core", SimpleNamespace(embree_version=lambda: 0))
     with pytest.raises(RuntimeError, match=r"built without it.*libembree-dev.*rebuild"):
-        ops.VisibilityScene(*soup())
+        ops.VisibilityScene(*soup(200))
     with ops.use_backend("reference"):
-        scene = ops.VisibilityScene(*soup())
+        scene = ops.VisibilityScene(*soup(200))
         assert scene.occluded(*rays(10)).any()
     with pytest.raises(RuntimeError, match="built without it"):
         scene.occluded(*rays(10))

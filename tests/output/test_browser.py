@@ -5,14 +5,14 @@ Without a browser these tests are skipped; `make page-test` brings one in.
 
 import json
 import math
+from functools import partial
 
+import asymmetric_scene
 import numpy as np
 import pytest
-import torch
-from asymmetric_scene import lamp, with_metal
+from asymmetric_scene import lamp, layers_of, with_metal
 from browser import browser, installed, pixels
 
-from univoxel.camera import Cameras
 from univoxel.cli.relight import relight_images
 from univoxel.color import linear_to_srgb
 from univoxel.data.images import write_exr
@@ -27,14 +27,7 @@ SIZE = 160
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # of glTF, from +Z up
 
 
-def looking(azimuth, elevation):
-    """A camera at some distance that looks at the object."""
-    phi, up = math.radians(azimuth), math.radians(elevation)
-    back = torch.tensor([math.cos(up) * math.cos(phi), math.cos(up) * math.sin(phi), math.sin(up)])
-    right = torch.tensor([-math.sin(phi), math.cos(phi), 0.0])
-    position = torch.tensor([0.08, 0.0, 0.08]) + 3.0 * back
-    pose = torch.stack([right, torch.linalg.cross(back, right), back, position], -1)[None]
-    return Cameras(pose, torch.full((1, 2), 2.2 * SIZE), torch.full((1, 2), SIZE / 2), SIZE, SIZE)
+looking = partial(asymmetric_scene.looking, size=SIZE, focal=2.2)
 
 
 def seen_by(camera):
@@ -120,13 +113,7 @@ def test_it_looks_as_relit(fresh, scene, folder, monkeypatch, azimuth, elevation
 def test_layers_are_the_materials(fresh, scene):
     camera = looking(25.0, 20.0)
     surface, _ = surface_of_view(scene, camera, 0)
-    expected = {
-        "albedo": linear_to_srgb(surface.albedo),
-        "roughness": surface.roughness[:, None].expand(-1, 3),
-        "metal": surface.metallic[:, None].expand(-1, 3),
-        "normal": 0.5 * surface.normal + 0.5,
-    }
-    for layer, values in expected.items():
+    for layer, values in layers_of(surface).items():
         fresh.run(f'univoxel.set({{layer: "{layer}"}})')
         shown, alpha = taken(fresh, camera)
         inside = (alpha > 0.999) & (surface.opacity.reshape(SIZE, SIZE).numpy() > 0.999)

@@ -9,6 +9,7 @@ import math
 import re
 import warnings
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pygltflib
@@ -301,10 +302,9 @@ def test_a_page_is_written_whole(scene, tmp_path, monkeypatch):
 
 
 def test_training_ends_well_without_a_page(tmp_path, monkeypatch, caplog):
-    def fail(run, path):
-        raise NoSurface("there is no surface")
-
-    monkeypatch.setattr("univoxel.output.page.write_page", fail)
+    monkeypatch.setattr(
+        "univoxel.output.page.write_page", Mock(side_effect=NoSurface("there is no surface"))
+    )
     with caplog.at_level(logging.INFO, "univoxel"):
         assert with_page(tmp_path) == tmp_path
     assert caplog.messages == ["the web page was not written: there is no surface"]
@@ -327,10 +327,9 @@ def test_a_notebook_shows_the_page(scene, tmp_path, monkeypatch):
     inside = re.fullmatch(r'<iframe srcdoc="([^"]*)" style="[^"]*"></iframe>', shown)[1]
     assert html.unescape(inside).startswith("<!doctype html>")
 
-    def nothing(run, scene, options):
-        raise NoSurface("there is no surface")
-
-    monkeypatch.setattr("univoxel.api.page_text", nothing)
+    monkeypatch.setattr(
+        "univoxel.api.page_text", Mock(side_effect=NoSurface("there is no surface"))
+    )
     assert Run(tmp_path)._repr_html_() is None
 
 

@@ -5,7 +5,6 @@ import sys
 
 import pytest
 import torch
-from analytic import write_scene
 from PIL import Image
 from tiny import three_stages
 
@@ -18,11 +17,6 @@ from univoxel.output import timelapse as module
 from univoxel.output.timelapse import LABEL, Timelapse
 from univoxel.scene import load_checkpoint, load_scene
 from univoxel.training import clock as clock_module
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return write_scene(tmp_path_factory.mktemp("sphere") / "data", views=8, size=24)
 
 
 @pytest.fixture

@@ -3,10 +3,9 @@
 import pytest
 import torch
 from asymmetric_scene import lopsided
-from balls import views
+from balls import surface_at, views
 
 from univoxel.color import srgb_to_linear
-from univoxel.core.records import Surface
 from univoxel.lights import EnvmapConfig
 from univoxel.lights.quadrature import half_sphere
 from univoxel.render.pipeline import TRACED_AT_ONCE, occlusion, outgoing, shade
@@ -18,10 +17,7 @@ POINTS = torch.tensor([[0.28, 0.28, 0.06], [-0.4, 0.0, 0.0]])
 
 def surface(points):
     normal = torch.nn.functional.normalize(points, dim=1)
-    n = len(points)
-    half = torch.full((n, 3), 0.5)
-    zero = torch.zeros(n)
-    return Surface(points, normal, torch.zeros(n, 4), half, half[:, 0], zero + 1, zero)
+    return surface_at(points, normal, features=torch.zeros(len(points), 4))
 
 
 @pytest.fixture(scope="module")

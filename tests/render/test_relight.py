@@ -4,10 +4,11 @@ import math
 
 import pytest
 import torch
-from integrator_scenes import DARK, WHITE, octahedron, sphere_points
+from balls import surface_at
+from integrator_scenes import DARK, WHITE, octahedron, shade, sphere_points
 
 from univoxel.camera import Cameras
-from univoxel.core.records import Mesh, Rays, Surface
+from univoxel.core.records import Mesh, Rays
 from univoxel.envmap import EnvMap, tables
 from univoxel.ops import PointLight, Sun, VisibilityScene
 from univoxel.render import relight as task
@@ -21,18 +22,9 @@ def a_traced_mesh():
     return task.TracedMesh(mesh, scene, 0.01)
 
 
-def a_surface(n=300, opacity=None):
+def a_surface(n=300, **opacity):
     normal, wo = sphere_points(n)
-    surface = Surface(
-        position=normal,
-        normal=normal,
-        features=torch.zeros(n, 1),
-        albedo=torch.full((n, 3), 0.5),
-        roughness=torch.full((n,), 0.5),
-        opacity=torch.ones(n) if opacity is None else opacity,
-        depth=torch.ones(n),
-    )
-    return surface, wo
+    return surface_at(normal, normal, **opacity), wo
 
 
 def a_bright_spot(height=16):
@@ -81,8 +73,6 @@ def test_passes_report_their_share_and_end_where_no_light_is():
 
 def test_strategies_agree_within_their_confidence():
     """The mean does not move with the strategy: apart by at most 4 standard errors of 64 runs."""
-    from integrator_scenes import shade
-
     mesh, scene = octahedron(0.7)
     normal, wo = sphere_points(20)
     radiance = torch.full((8, 16, 3), 0.3)
@@ -164,7 +154,7 @@ def pictures(background, ground, opacity=0.5):
     pose = torch.tensor([[[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5]]])
     cameras = Cameras(pose, torch.full((1, 2), 8.0), torch.full((1, 2), 2.0), 4, 4)
     n = 16
-    surface, _ = a_surface(n, torch.tensor([opacity, 0.0]).repeat(n // 2))
+    surface, _ = a_surface(n, opacity=torch.tensor([opacity, 0.0]).repeat(n // 2))
     wo = torch.tensor([0.0, 0, 1]).repeat(n, 1)
     quality = Quality(samples=16, bounces=0, background=background, ground=ground)
     lighting = task.Lighting(tables(WHITE), (SUN,))

@@ -5,31 +5,23 @@ import json
 
 import pytest
 import torch
-from analytic import photos_of, sphere_scene, write_scene
+from analytic import photos_of, sphere_scene
 from observed_points import Steps, no_metal, problem_on_a_sphere
-from plain import plain_stage, plain_training
+from plain import plain_stage, plain_training, small_scene
 
 from univoxel.cli import trainer as task
 from univoxel.config import JointConfig
-from univoxel.lights import SGConfig
 from univoxel.optim import RowAdam
-from univoxel.scene import SceneConfig, load_scene
+from univoxel.scene import load_scene
 from univoxel.training import descent, equations, joint_solve, loop, newton
 from univoxel.training import progress as progress_module
 from univoxel.training.descent import LIMIT, PROOF, Guard
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return write_scene(tmp_path_factory.mktemp("sphere") / "data", views=8, size=24)
-
-
 def small(data, out):
-    light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=32)
     stage = plain_stage(voxels=0.008, iterations=24, share=0.5, rays=256)
     stages = (stage, dataclasses.replace(stage, physical_from=0.0))
-    sizes = SceneConfig(channels=4, material_channels=2, hidden=16, light=light)
-    return plain_training(data, out, stages, minutes=2.0, scene=sizes)
+    return plain_training(data, out, stages, minutes=2.0, scene=small_scene())
 
 
 def events(out):

@@ -4,7 +4,7 @@ from dataclasses import asdict, replace
 
 import pytest
 import torch
-from analytic import photos_of, scene_of, sphere_scene, write_scene
+from analytic import photos_of, scene_of, sphere_scene
 from observed_points import (
     BLUE,
     RED,
@@ -16,17 +16,16 @@ from observed_points import (
     random_problem,
     sphere_of,
 )
-from plain import plain_stage, plain_training
+from plain import plain_stage, plain_training, small_scene
 from torch.nn.functional import normalize
 
 from univoxel import brdf
 from univoxel.cli import trainer as train_task
 from univoxel.config import JointConfig
-from univoxel.lights.sg import SGConfig
 from univoxel.optim import RowAdam
 from univoxel.render.observations import MaterialLabels, Mirrors, prefiltered_roughness
 from univoxel.render.pipeline import extract_mesh
-from univoxel.scene import SceneConfig, load_checkpoint
+from univoxel.scene import load_checkpoint
 from univoxel.training import joint_solve, progress
 from univoxel.training.newton import NewtonRound, newton_round_
 
@@ -367,15 +366,13 @@ def test_without_paint_materials_stay(monkeypatch):
     assert all(torch.equal(after[k], before[k]) for k in after)
 
 
-def test_a_solve_that_was_killed_goes_on_in_its_round(tmp_path, monkeypatch):
+def test_a_solve_that_was_killed_goes_on_in_its_round(data, tmp_path, monkeypatch):
     """Map, materials and round are those of the checkpoint; nothing before is done again."""
-    data = write_scene(tmp_path / "data", views=8, size=24)
-    light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
     stages = (
         plain_stage(voxels=0.01, iterations=10, share=0.4, rays=256, physical_from=0.5),
         JointConfig(iterations=30, rounds=3, points=300, newton_points=100, rays=256, tracing=1),
     )
-    sizes = SceneConfig(channels=4, material_channels=2, hidden=16, sky_nodes=32, light=light)
+    sizes = small_scene(sky_nodes=32)
     cfg = plain_training(data, tmp_path / "run", stages, minutes=5.0, scene=sizes)
     started, newtons, steps = [], [], []
     initialise_, newton_round, objective = (
@@ -416,16 +413,14 @@ def test_a_solve_that_was_killed_goes_on_in_its_round(tmp_path, monkeypatch):
     assert load_checkpoint(cfg.out)[1]["within"] is None
 
 
-def test_a_refit_leaves_materials_bit_for_bit(tmp_path, monkeypatch):
-    data = write_scene(tmp_path / "data", views=8, size=24)
-    light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
+def test_a_refit_leaves_materials_bit_for_bit(data, tmp_path, monkeypatch):
     stage = plain_stage(voxels=0.01, iterations=30, share=0.4, rays=256, physical_from=0.5)
     stages = (
         stage,
         JointConfig(iterations=20, points=300, newton_points=100, rays=256, tracing=1),
         replace(stage, iterations=10, refit=True, physical_from=0.0),
     )
-    sizes = SceneConfig(channels=4, material_channels=2, hidden=16, sky_nodes=32, light=light)
+    sizes = small_scene(sky_nodes=32)
     run_stage, states = train_task.run_stage, []
 
     def watched(scene, *rest):

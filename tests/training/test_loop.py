@@ -4,14 +4,15 @@ import copy
 import json
 import math
 import time
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 from analytic import write_scene
-from plain import plain_stage, plain_training
+from check_op import same_on_threads
+from plain import plain_stage, plain_training, small_scene
 
 from univoxel.cli.trainer import train
 from univoxel.config import LossConfig
@@ -19,11 +20,10 @@ from univoxel.data import load_photos
 from univoxel.fields.features import Levels
 from univoxel.fields.field import dense_field, hash_field
 from univoxel.fields.grid import fit_grid
-from univoxel.lights import SGConfig
 from univoxel.lights.base import Regularisation
 from univoxel.preparation.hull import mask_distances, visual_hull
 from univoxel.render.pipeline import surface_at
-from univoxel.scene import Scene, SceneConfig
+from univoxel.scene import Scene
 from univoxel.training import loop, progress
 from univoxel.training.loop import add_gradient_, batch_at, light_priors, losses_of
 from univoxel.training.pixels import TrainingPixels, split_pixels
@@ -59,9 +59,7 @@ def scene(request, pixels):
     else:
         field = hash_field(grid, Levels.of(grid.bounds(), grid.voxel_size, 2, 512), sdf)
     torch.nn.init.normal_(field.features)
-    light = SGConfig(lobes=4, hidden=16, directions=32)
-    sizes = SceneConfig(channels=4, material_channels=2, hidden=16, light=light)
-    return Scene(sizes, field, 2 / grid.voxel_size).train()
+    return Scene(small_scene(), field, 2 / grid.voxel_size).train()
 
 
 def test_what_is_read_beside_the_surface_adds_its_gradient(scene, pixels):
@@ -81,20 +79,15 @@ def test_what_is_read_beside_the_surface_adds_its_gradient(scene, pixels):
 
 
 def test_bits_do_not_depend_on_threads(scene, pixels, tmp_path):
-    stage = replace(STAGE, iterations=3)
-    cfg = plain_training(Path("data"), tmp_path, (stage,))
-    before, found = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
-            torch.manual_seed(0)
-            trained = copy.deepcopy(scene)
-            loop.run_stage(trained, cfg, stage, pixels, Progress(cfg, time.monotonic(), {}))
-            found.append([p.detach() for p in trained.parameters()])
-    finally:
-        torch.set_num_threads(before)
-    assert not torch.equal(trained.field.sdf, scene.field.sdf)
-    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
+    cfg = plain_training(Path("data"), tmp_path, (STAGE,))
+
+    def trained():
+        torch.manual_seed(0)
+        copied = copy.deepcopy(scene)
+        loop.run_stage(copied, cfg, STAGE, pixels, Progress(cfg, time.monotonic(), {}))
+        return [p.detach() for p in (copied.field.sdf, *copied.parameters())]
+
+    assert not torch.equal(same_on_threads(trained, (1, 2))[0], scene.field.sdf)
 
 
 @pytest.mark.parametrize("best", [0.7, 1.0, 1.4])
@@ -121,7 +114,7 @@ def test_masks_whose_edges_were_moved_do_not_tell_how_sharp_the_density_is(monke
     assert scene.inv_s == 20.0
 
 
-def test_patches_are_compared_in_every_second_step_and_told_in_all(tmp_path, monkeypatch):
+def test_patches_are_compared_in_every_second_step_and_told_in_all(data, tmp_path, monkeypatch):
     compared = []
 
     def disagreement(scene, brightness, cameras, surface, *_):
@@ -130,11 +123,10 @@ def test_patches_are_compared_in_every_second_step_and_told_in_all(tmp_path, mon
 
     monkeypatch.setattr(loop.patches, "disagreement", disagreement)
     monkeypatch.setattr(progress, "REPORT_SECONDS", -1.0)
-    data = write_scene(tmp_path / "data", views=8, size=24)
-    light = SGConfig(lobes=4, hidden=16, directions=32, directions_eval=64)
-    sizes = SceneConfig(channels=4, material_channels=2, hidden=16, sky_nodes=0, light=light)
     stage = plain_stage(voxels=0.01, iterations=20, share=1.0, rays=64, patches_from=0.42)
-    cfg = plain_training(data, tmp_path / "run", (stage,), minutes=2.0, scene=sizes)
+    cfg = plain_training(
+        data, tmp_path / "run", (stage,), minutes=2.0, scene=small_scene(sky_nodes=0)
+    )
     train(cfg)
     assert len(compared) == 5
     lines = [json.loads(line) for line in (cfg.out / "log.jsonl").read_text().splitlines()]

@@ -3,6 +3,7 @@ off."""
 
 import math
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -129,15 +130,10 @@ def test_points_that_see_no_sky_are_as_their_neighbours():
 def test_fewer_than_half_of_the_voters_are_not_asked(monkeypatch):
     """Nor what is near them looked for, which takes most of the time where nothing mirrors."""
     scene, problem = under_fine_map(lambda n: n[:, 2] > 2, white)
-    asked, neighbours = [], mirrors.neighbours
-
-    def counted(key, count):
-        asked.append(count)
-        return neighbours(key, count)
-
-    monkeypatch.setattr(mirrors, "neighbours", counted)
+    neighbours = Mock(wraps=mirrors.neighbours)
+    monkeypatch.setattr(mirrors, "neighbours", neighbours)
     assert mirrors.find_mirrors(scene, problem) is None
-    assert asked == [mirrors.NEIGHBOURS]
+    assert [call.args[1] for call in neighbours.call_args_list] == [mirrors.NEIGHBOURS]
 
     def some(count):
         def found(seen, *_):
@@ -148,10 +144,10 @@ def test_fewer_than_half_of_the_voters_are_not_asked(monkeypatch):
 
     monkeypatch.setattr(mirrors, "VOTERS", 10)
     for count, voted in ((5, False), (6, True)):
-        asked.clear()
+        neighbours.reset_mock()
         monkeypatch.setattr(mirrors, "mirrors_among", some(count))
         mirrors.find_mirrors(scene, problem)
-        assert (10 in asked) == voted
+        assert (10 in [call.args[1] for call in neighbours.call_args_list]) == voted
 
 
 def test_light_that_turns_has_no_common_map():

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -21,23 +22,36 @@ from univoxel.training.newton import (
 )
 
 CFG = JointConfig(newton_points=400, newton_views=8, newton_steps=6)
+PAINT = (0.5, 0.4, 0.3)
+
+
+def painted(map, views=12, believed=0.3):
+    """A scene that knows the paint, and believes this of its roughness, which is 0.3; of another
+    map than the one that it is photographed under."""
+    nodes = len(map)
+    scene = scene_of(PAINT, believed, nodes)
+    problem = problem_on_a_sphere(400, views, nodes, scene)
+    shown = prefiltered_roughness(torch.full((400,), 0.3), nodes)  # a node is a patch of sky
+    return scene, photographed(problem, map, torch.tensor(PAINT).expand(400, 3), shown)
+
+
+def uneven():
+    torch.manual_seed(2)
+    return (0.6 * torch.randn(64, 3)).exp() * 0.6
+
+
+def check_solved(scene, problem, labels, true):
+    """By two rounds; what is left is the smoothness, which this uneven map has none of."""
+    costs = [c for _ in range(2) for c in newton_round_(scene, problem, labels, CFG).costs]
+    assert len(costs) == 2 * CFG.newton_steps
+    assert costs[-1] < 1e-3 * costs[0]
+    error = scene.sky.log_radiance.detach() - true.log()
+    assert error.abs().mean() < 0.25 * true.log().abs().mean()
 
 
 def test_newton_recovers_a_known_map():
-    albedo, roughness, nodes = (0.5, 0.4, 0.3), 0.3, 64
-    scene = scene_of(albedo, roughness, nodes)
-    problem = problem_on_a_sphere(400, 12, nodes, scene)
-    torch.manual_seed(2)
-    true = (0.6 * torch.randn(nodes, 3)).exp() * 0.6
-    shown = prefiltered_roughness(torch.full((400,), roughness), nodes)  # a node is a patch of sky
-    problem = photographed(problem, true, torch.tensor(albedo).expand(400, 3), shown)
-    costs = newton_round_(scene, problem, no_metal(problem), CFG).costs
-    costs += newton_round_(scene, problem, no_metal(problem), CFG).costs
-    assert len(costs) == 2 * CFG.newton_steps
-    error = scene.sky.log_radiance.detach() - true.log()
-    assert costs[-1] < 1e-3 * costs[0]
-    # What is left is the smoothness, which this uneven map has none of
-    assert error.abs().mean() < 0.25 * true.log().abs().mean()
+    scene, problem = painted(true := uneven())
+    check_solved(scene, problem, no_metal(problem), true)
 
 
 def test_newton_finds_the_map_under_a_roughness_that_is_wrong(monkeypatch):
@@ -45,24 +59,17 @@ def test_newton_finds_the_map_under_a_roughness_that_is_wrong(monkeypatch):
     errors = []
     for free in (1e-6, newton.FOLLOWS):
         monkeypatch.setattr(newton, "FOLLOWS", free)
-        nodes, albedo = 64, torch.tensor([0.5, 0.4, 0.3])
-        scene = scene_of(tuple(albedo.tolist()), 0.45, nodes)
-        problem = problem_on_a_sphere(400, 12, nodes, scene)
-        shown = prefiltered_roughness(torch.full((400,), 0.3), nodes)
-        problem = photographed(problem, lamps(nodes), albedo.expand(400, 3), shown)
+        scene, problem = painted(lamps(64), believed=0.45)
         for _ in range(2):
             newton_round_(scene, problem, no_metal(problem), CFG)
-        errors.append((scene.sky.log_radiance.detach() - lamps(nodes).log()).abs().mean())
+        errors.append((scene.sky.log_radiance.detach() - lamps(64).log()).abs().mean())
     assert errors[1] < 0.5 * errors[0]  # not all: roughness has a pull to where it was
 
 
 def test_a_round_is_judged_by_observations_that_it_did_not_use():
     """It explains them if they show the same, and their error counts in full where they do not;
     clipped pixels are lower bounds, and of points that have no other observation nothing counts."""
-    albedo, nodes = torch.tensor([0.5, 0.4, 0.3]), 64
-    problem = problem_on_a_sphere(400, 12, nodes, scene := scene_of((0.5, 0.4, 0.3), 0.3, nodes))
-    shown = prefiltered_roughness(torch.full((400,), 0.3), nodes)
-    problem = photographed(problem, lamps(nodes), albedo.expand(400, 3), shown)
+    scene, problem = painted(lamps(64))
     fitted, unseen = halves(problem)
     start = scene.sky.log_radiance.detach().clone()
 
@@ -93,34 +100,26 @@ def test_a_round_is_judged_by_observations_that_it_did_not_use():
 
 @pytest.mark.parametrize("views", [2, 3])
 def test_newton_learns_from_few_photographs(views):
-    albedo, roughness, nodes = (0.5, 0.4, 0.3), 0.3, 64
-    scene = scene_of(albedo, roughness, nodes)
-    problem = problem_on_a_sphere(400, views, nodes, scene)
-    true = (0.6 * torch.randn(nodes, 3)).exp() * 0.6
-    shown = prefiltered_roughness(torch.full((400,), roughness), nodes)
-    problem = photographed(problem, true, torch.tensor(albedo).expand(400, 3), shown)
+    scene, problem = painted(uneven(), views)
     costs = newton_round_(scene, problem, no_metal(problem), CFG).costs
     assert len(costs) == CFG.newton_steps
     assert costs[-1] < 0.1 * costs[0]
 
 
 def test_newton_in_no_time_takes_few_points(monkeypatch):
-    scene, counts = scene_of((0.5, 0.4, 0.3), 0.4, 32), []
+    scene = scene_of((0.5, 0.4, 0.3), 0.4, 32)
     problem = problem_on_a_sphere(100, 12, 32, scene)
-    equations = newton.equations.normal_equations
-
-    def counted(transport, *arguments):
-        counts.append(len(transport.diffuse))
-        return equations(transport, *arguments)
-
-    monkeypatch.setattr(newton.equations, "normal_equations", counted)
+    equations = Mock(wraps=newton.equations.normal_equations)
+    monkeypatch.setattr(newton.equations, "normal_equations", equations)
     monkeypatch.setattr(newton, "NEWTON_CHUNK", 20)
     cfg = replace(CFG, newton_steps=2)
     newton_round_(scene, problem, no_metal(problem), cfg, seconds=0.0)
-    assert counts == [20] * (1 + cfg.newton_steps * newton.MIN_PARTS)  # one to measure
-    counts.clear()
+    parts = 1 + cfg.newton_steps * newton.MIN_PARTS  # one to measure
+    assert [len(call.args[0].diffuse) for call in equations.call_args_list] == [20] * parts
+    equations.reset_mock()
     newton_round_(scene, problem, no_metal(problem), cfg, seconds=1e3)
-    assert counts == [20] * (1 + cfg.newton_steps * 5)
+    parts = 1 + cfg.newton_steps * 5
+    assert [len(call.args[0].diffuse) for call in equations.call_args_list] == [20] * parts
 
 
 def test_no_steps_of_newton_leave_the_map():
@@ -158,17 +157,11 @@ def test_metals_show_the_map():
     scene = scene_of(tuple(base.tolist()), roughness, nodes)
     problem = problem_on_a_sphere(count, 12, nodes, scene)
     metal = problem.observations.normal[:, 0] > 0
-    torch.manual_seed(2)
-    true = (0.6 * torch.randn(nodes, 3)).exp() * 0.6
+    true = uneven()
     shown = prefiltered_roughness(torch.full((count,), roughness), nodes)
     diffuse, f0 = brdf.split(base.expand(count, 3), metal.float())
     problem = photographed(problem, true, diffuse, shown, f0)
-    costs = newton_round_(scene, problem, MaterialLabels(metal), CFG).costs
-    costs += newton_round_(scene, problem, MaterialLabels(metal), CFG).costs
-    assert costs[-1] < 1e-3 * costs[0]
-    error = scene.sky.log_radiance.detach() - true.log()
-    # What is left is the smoothness, as above
-    assert error.abs().mean() < 0.25 * true.log().abs().mean()
+    check_solved(scene, problem, MaterialLabels(metal), true)
 
 
 def test_newton_starts_from_the_albedo_that_it_is_given():

@@ -6,10 +6,11 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from balls import surface_at
 from torch.nn.functional import normalize
 
 from univoxel.camera import Cameras, image_rays, projection_matrices
-from univoxel.core.records import Rays, Surface
+from univoxel.core.records import Rays
 from univoxel.data import Photos
 from univoxel.training import patches
 
@@ -19,13 +20,8 @@ EYES = torch.tensor(
 SIZE = 64
 
 
-def nothing_hides():
-    tracer = SimpleNamespace(occluded=lambda start, *_: torch.zeros(len(start), dtype=torch.bool))
-    return SimpleNamespace(occluder=lambda: tracer, field=SimpleNamespace(voxel_size=0.02))
-
-
-def everything_hides():
-    tracer = SimpleNamespace(occluded=lambda start, *_: torch.ones(len(start), dtype=torch.bool))
+def nothing_hides(but_all=False):
+    tracer = SimpleNamespace(occluded=lambda start, *_: torch.full((len(start),), but_all))
     return SimpleNamespace(occluder=lambda: tracer, field=SimpleNamespace(voxel_size=0.02))
 
 
@@ -77,16 +73,8 @@ def rays_of(count=200):
 
 def surface_of(rays, height, normal=(0.0, 0.0, 1.0)):
     depth = plane_at(rays, height)
-    n = len(depth)
-    return Surface(
-        position=rays.origin + depth[:, None] * rays.direction,
-        normal=normalize(torch.as_tensor(normal), dim=0).expand(n, 3),
-        features=torch.zeros(n, 1),
-        albedo=torch.zeros(n, 3),
-        roughness=torch.zeros(n),
-        opacity=torch.ones(n),
-        depth=depth,
-    )
+    normal = normalize(torch.as_tensor(normal), dim=0).expand(len(depth), 3)
+    return surface_at(rays.origin + depth[:, None] * rays.direction, normal, depth=depth)
 
 
 def disagreement(height, normal=(0.0, 0.0, 1.0), scene=None, shots=None):
@@ -144,7 +132,7 @@ def test_what_cannot_be_compared_pulls_nothing():
     plain = replace(photos(), color=torch.full((5, SIZE, SIZE, 3), 0.5))
     assert disagreement(torch.tensor(0.1), shots=plain) == 0
     assert disagreement(torch.tensor(0.1), shots=photos(alpha=0.5)) == 0
-    assert disagreement(torch.tensor(0.1), scene=everything_hides()) == 0
+    assert disagreement(torch.tensor(0.1), scene=nothing_hides(but_all=True)) == 0
     assert disagreement(torch.tensor(0.1), torch.tensor([1.0, 0.0, -0.5])) == 0
 
 

@@ -3,7 +3,6 @@
 import dataclasses
 
 import pytest
-from analytic import write_scene
 from plain import plain_stage, plain_training
 
 from univoxel.cli.trainer import train
@@ -45,8 +44,7 @@ def test_without_patience_nothing_is_looked_at():
     assert looks(0.0, lambda done: 20.0) == ([], [])
 
 
-def test_a_training_that_gains_too_little_is_shortened(tmp_path):
-    data = write_scene(tmp_path / "data", views=8, size=24)
+def test_a_training_that_gains_too_little_is_shortened(data, tmp_path):
     light = SGConfig(lobes=2, hidden=8, directions=16, directions_eval=16)
     stage = plain_stage(voxels=0.008, iterations=60, share=1.0, rays=128, physical_from=0.0)
     sizes = SceneConfig(4, material_channels=2, hidden=8, sky_nodes=16, light=light)

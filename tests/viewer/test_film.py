@@ -3,6 +3,7 @@
 import io
 import math
 from itertools import pairwise
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -25,10 +26,7 @@ def subject():
 
 @pytest.fixture
 def without_encoder(monkeypatch):
-    def require(name):
-        raise MissingExtra("no encoder")
-
-    monkeypatch.setattr(module, "require", require)
+    monkeypatch.setattr(module, "require", Mock(side_effect=MissingExtra("no encoder")))
 
 
 def test_cameras_go_round_a_vertical_axis(subject):

@@ -1,6 +1,5 @@
 """Frames of the viewer against the pictures of `univoxel relight` and the scene's own layers."""
 
-import math
 import sys
 import threading
 import types
@@ -10,9 +9,8 @@ from itertools import islice
 import asymmetric_scene
 import pytest
 import torch
-from asymmetric_scene import subject_of, with_metal
+from asymmetric_scene import layers_of, looking, subject_of, with_metal
 
-from univoxel.camera import Cameras
 from univoxel.cli.relight import RelightOptions, relight_images
 from univoxel.color import linear_to_srgb
 from univoxel.errors import UserError
@@ -44,12 +42,7 @@ def lamp():
 
 @pytest.fixture
 def camera():
-    phi, up = math.radians(25), math.radians(30)
-    back = torch.tensor([math.cos(up) * math.cos(phi), math.cos(up) * math.sin(phi), math.sin(up)])
-    right = torch.tensor([-math.sin(phi), math.cos(phi), 0.0])
-    position = torch.tensor([0.08, 0.0, 0.08]) + 3.0 * back
-    pose = torch.stack([right, torch.linalg.cross(back, right), back, position], -1)[None]
-    return Cameras(pose, torch.full((1, 2), 2.0 * SIZE), torch.full((1, 2), SIZE / 2), SIZE, SIZE)
+    return looking(25, 30, SIZE, focal=2.0)
 
 
 def straight(picture):
@@ -104,11 +97,7 @@ def test_layers_are_the_materials(scene, subject, lamp, camera):
         camera.camera_to_world[0, :, 2]
     )
     near, far = ends.min(), ends.max()
-    expected = {
-        "albedo": linear_to_srgb(surface.albedo),
-        "roughness": surface.roughness[:, None].expand(-1, 3),
-        "metal": surface.metallic[:, None].expand(-1, 3),
-        "normal": 0.5 * surface.normal + 0.5,
+    expected = layers_of(surface) | {
         "depth": (1 - (depth - near) / (far - near))[:, None].expand(-1, 3),
     }
     assert set(expected) == set(LAYERS) - {"render", "expected error"}

@@ -4,11 +4,11 @@ import dataclasses
 import socket
 import time
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
-from analytic import write_scene
 from asymmetric_scene import lopsided
 from browser import browser, installed
 from tiny import three_stages
@@ -28,11 +28,6 @@ from univoxel.viewer.training import Spectators, fitted, watched, words
 
 pytest.importorskip("viser")
 ANY = ("127.0.0.1", 0)
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return write_scene(tmp_path_factory.mktemp("sphere") / "data", views=8, size=24)
 
 
 class Client:
@@ -86,10 +81,7 @@ def test_training_does_not_notice(data, tmp_path, looking, plain):
 def test_a_view_that_fails_is_told_once_and_training_goes_on(
     data, tmp_path, looking, plain, monkeypatch, caplog
 ):
-    def fail(*arguments):
-        raise RuntimeError("no such picture")
-
-    monkeypatch.setattr(module, "frame", fail)
+    monkeypatch.setattr(module, "frame", Mock(side_effect=RuntimeError("no such picture")))
     assert_same(plain, train(three_stages(data, tmp_path / "run"), view=ANY))
     assert looking.pictures == []
     assert caplog.text.count("training continues") == 1

@@ -149,7 +149,9 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
         try:
             train = photos_of(run, data, "train")
         except (UserError, OSError) as error:  # views are the model's only
-            log.info("full size: no photographs found, so novel views use only the model: %s", error)
+            log.info(
+                "full size: no photographs found, so novel views use only the model: %s", error
+            )
             train = None
         result |= measure_full_size(scene, run, photos, train, save)
     figures = views.say_trust(surveyed, report.get("troubles", []), save)
