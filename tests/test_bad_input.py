@@ -187,8 +187,8 @@ def nan(tensor):
             edited_tensor("material.net.0.weight", lambda t: None),
             "material.net.0.weight is missing",
         ),
-        (edited_tensor("field.feature_rows", lambda t: t - 10**6), "expected field.features "),
-        (edited_tensor("field.feature_values", lambda t: t[:1]), "expected field.features "),
+        (edited_tensor("field.feature_rows", lambda t: t - 10**6), "field.features"),
+        (edited_tensor("field.feature_values", lambda t: t[:1]), "field.features"),
     ],
 )
 def test_checkpoints_that_contradict_themselves(run, refused, change, message):

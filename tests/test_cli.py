@@ -460,7 +460,7 @@ def test_output_that_nobody_reads_to_its_end(arguments):
         (["--set", "seed"], "--set seed: expected FIELD=VALUE"),
         (["--set", "sede=1"], "--set sede=1: no field 'sede'; the fields are: data, out, stages"),
         (["--set", "seed.x=1"], "--set seed.x=1: no field 'x'; the fields are: none"),
-        (["--set", "seed=fast"], "--set seed=fast: expected a int such as 0, got 'fast'"),
+        (["--set", "seed=fast"], "--set seed=fast: expected a value such as 0 (int), got 'fast'"),
         (
             ["--set", "stages.4.voxels=1"],
             "--set stages.4.voxels=1: no field '4'; the fields are: 0, 1",

@@ -75,7 +75,9 @@ def test_it_may_be_known_whether_all_is_metal():
     assert isinstance(some, JointConfig)
     assert some.only_metal is False
     lobes = preset("draft", Path("data"), Path("out"), "sg")
-    with pytest.raises(UserError, match=r"metal=all needs light=hybrid, .* got sg") as refused:
+    with pytest.raises(
+        UserError, match=r"metal=all needs light=hybrid, .* got light=sg"
+    ) as refused:
         with_metal(lobes, "all")
     assert refused.value.arguments == ("metal", "light")
 

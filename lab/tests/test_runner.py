@@ -170,7 +170,7 @@ def test_mistakes_are_found_before_anything_is_trained(data, tmp_path, trained):
     refused(ValueError, r"settings with different names, got \['../up'\]", settings=[escaping])
     refused(ValueError, "samples must be at least 1, got 0", samples=0)
     unknown = dataclasses.replace(SMALL, changes=("seed=x",))
-    refused(ValueError, "changes=seed=x: expected a int", settings=[unknown])
+    refused(ValueError, "changes=seed=x: expected a value such as 0 .int", settings=[unknown])
     assert not trained
     assert not out.exists()
 

@@ -117,10 +117,10 @@ def test_the_time_is_told_once_it_is_measured(monkeypatch, caplog):
     clock = iter([0.0, 5.1, 6.0, 7.0])
     monkeypatch.setattr(module, "monotonic", lambda: next(clock))
     masked = module.timed(lambda photo: photo[..., 0] / 255, "isnet-general-use", 60)
-    assert caplog.messages == ["masks: using the network isnet-general-use, 179 MB"]
+    assert caplog.messages == ["masks: using the network isnet-general-use (179 MB)"]
     for _ in range(2):
         assert torch.equal(masked(photograph()), photograph()[..., 0] / 255)
-    assert caplog.messages[1:] == ["masks: 5.1 s per photograph, about 5 min for all 60"]
+    assert caplog.messages[1:] == ["masks: 5.1 s per photograph, about 5 min for all 60 photographs"]
 
 
 def test_rembg_goes_first(home, monkeypatch, caplog):

@@ -154,7 +154,7 @@ def test_what_is_left_out_is_named(scene):
     out, said = scene
     assert f"{VIEWS + 1} photographs from 2 cameras (2 zoom settings)" in said[0]
     assert "2 could not be read: broken.jpg, notes.txt" in said[0]
-    assert any(f"{VIEWS} of {VIEWS + 1} registered" in line for line in said)
+    assert any(f"{VIEWS} of {VIEWS + 1} photographs registered" in line for line in said)
     assert any("white.jpg (no features that can be matched)" in line for line in said)
     report = json.loads((out / "poses.json").read_text())
     rows = {row["name"]: row for row in report["photographs"]}

@@ -313,7 +313,7 @@ def test_mistakes_are_found_before_anything_is_begun(scenes, tmp_path, monkeypat
         ("samples", 0, "samples must be at least 1, got 0"),
         ("steps", (), "steps must be among poses, masks, .*, got none"),
         ("steps", ("fly",), "steps must be among .*, got fly"),
-        ("changes", ("seed=x",), "changes=seed=x: expected a int"),
+        ("changes", ("seed=x",), "changes=seed=x: expected a value such as 0 .int"),
         (
             "config",
             tmp_path / "none.json",

@@ -150,7 +150,7 @@ def test_few_masks_stay_as_they_are(tmp_path, caplog):
     masks = [photos.picture(view)[1] for view in range(4)]
     folder = write_masks(tmp_path / "masks", masks, photos.names)
     task.cutout(data, tmp_path / "cut", folder)
-    assert "that needs 12 photographs and there are only 4" in caplog.text
+    assert "this needs 12 photographs and there are only 4" in caplog.text
     masks[1][:] = 0
     write_masks(folder, masks, photos.names)
     with pytest.raises(DataError, match="the mask of r_1 is empty"):
@@ -265,6 +265,8 @@ def test_options_of_masks_that_cannot_be(tmp_path, capsys, options, said):
 
 def test_where_nothing_stands_out_the_way_out_is_told(tmp_path, with_masks):
     """Smooth balls before nothing have no depth that could be found."""
-    with pytest.raises(DataError, match="use source=rembg or a folder of masks instead of none"):
+    with pytest.raises(
+        DataError, match="use source=rembg or a folder of masks instead of source=none"
+    ):
         task.cutout(with_masks[0], tmp_path / "cut", "none")
     assert not (tmp_path / "cut").exists()

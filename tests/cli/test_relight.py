@@ -164,7 +164,7 @@ def test_resolution_scales_the_views(run):
 
 
 def test_test_views_come_from_the_data_of_the_run(run):
-    with pytest.raises(DataError, match=r"a run, but it has no config\.json"):
+    with pytest.raises(DataError, match=r"a run, but config\.json is missing"):
         frames(run, cameras="test")
     (run / "run" / "config.json").write_text("{}")
     with pytest.raises(DataError, match=r"config\.json: expected data to be a folder"):

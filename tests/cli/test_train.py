@@ -321,7 +321,7 @@ def test_a_training_says_how_it_came_out(data, tmp_path, caplog):
 def test_a_limit_may_be_enough_for_the_steps_alone(caplog):
     """Then it does not promise more than all of them."""
     caplog.set_level("INFO", "univoxel")
-    clock = SimpleNamespace(seconds=0.0, planned=20.0, limit=120.0, preparation=0.0)
+    clock = SimpleNamespace(seconds=0.0, planned=20.0, limit=120.0, preparation=0.0, afterwards=0.0)
     progress = SimpleNamespace(clock=clock, cfg=SimpleNamespace(minutes=2.0), slower=1.0)
     cameras = SimpleNamespace(width=4000, height=3000)
     photos = type("", (), {"cameras": cameras, "downscale": 1, "__len__": lambda self: 60})()

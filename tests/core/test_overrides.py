@@ -38,7 +38,7 @@ def test_one_number_of_several(config):
     ("change", "message"),
     [
         ("1.sharpness=(0.0, 0.2)", r"sharpness must be two numbers above 0, got \(0.0, 0.2\)"),
-        ("1.sharpness=0.4", "expected a tuple such as"),
+        ("1.sharpness=0.4", "expected a value such as"),
         ("2.entropy.asked=1", "no field 'asked'; the fields are: teaching_steps"),
         ("1.sharpness=('soft', 'sharp')", "sharpness must be two numbers above 0"),
     ],

@@ -87,7 +87,7 @@ TEXT = {
     ),
     "parameters": (
         cameras(("SIMPLE_PINHOLE", "PINHOLE")),
-        r"cameras\.txt: this file .*: camera 3: 3 parameters do not fit PINHOLE",
+        r"cameras\.txt: this file .*: camera 3: 3 parameters do not fit model PINHOLE",
     ),
     "words": (cameras(("11.0", "wide")), r"cameras\.txt: this file .* 'wide'"),
     "focal length": (

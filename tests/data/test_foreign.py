@@ -278,7 +278,7 @@ def two_fit(folder):
         (
             write_polycam,
             lambda f: (f / "keyframes/corrected_images").rename(f / "keyframes/images"),
-            "corrected_images; those in .*keyframes/images belong to the cameras in .*/cameras",
+            "corrected_images; the images in .*keyframes/images belong to .* in .*/cameras",
         ),
         (
             write_nerfstudio,

@@ -87,7 +87,7 @@ SENSOR = '<sensor id="3" label="unknown" type="frame">'
             edited(("<chunk", "<x><chunk"), ("</chunk>", "</chunk></x>")),
             "expected one chunk, got 0",
         ),
-        (edited(("transform>", "other>")), "xml: expected cameras with a transform, got 11"),
+        (edited(("transform>", "other>")), "xml: none of the 11 cameras is both"),
         (edited((SENSOR, '<sensor id="4">')), "camera p_000: this sensor is not listed"),
         (edited((SENSOR, '<sensor id="3" type="fisheye">')), "expected a sensor of type frame"),
         (edited(("calibration", "other")), "camera p_000: expected a calibration, found none"),

@@ -28,7 +28,7 @@ def test_images_that_were_not_placed(tmp_path):
     (tmp_path / "inputs" / "images" / "p_002.png").unlink()
     photos = load_photos(tmp_path)
     assert photos.names == ["p_001", "p_004", "p_006", "p_007", "p_008", "p_009"]
-    assert "left out, 2 photographs left out because they have no camera" in photos.about
+    assert "are missing, 2 photographs left out because they have no camera" in photos.about
 
 
 def test_names_as_the_readme_has_them(tmp_path):

@@ -109,10 +109,22 @@ def test_truth(tmp_path):
     ("place", "array", "message"),
     [
         ("z_depth/0000.npy", np.ones((2, 2)), r"0000.npy: expected 12x8 pixels .*, got 2x2"),
-        ("z_depth/0000.npy", np.ones((8, 12, 1)), r"expected finite \[H, W\], got \[8, 12, 1\]"),
-        ("z_depth/0000.npy", np.full((8, 12), np.nan), r"finite \[H, W\], got \[8, 12\] of float"),
-        ("surface_normal/0000.npy", np.ones((8, 12)), r"finite \[H, W, 3\], got \[8, 12\]"),
-        ("surface_normal/0000.npy", np.ones((8, 12, 3), int), r"finite \[H, W, 3\], .* of int64"),
+        (
+            "z_depth/0000.npy",
+            np.ones((8, 12, 1)),
+            r"expected finite values \[H, W\], got \[8, 12, 1\]",
+        ),
+        (
+            "z_depth/0000.npy",
+            np.full((8, 12), np.nan),
+            r"finite values \[H, W\], got \[8, 12\] of float",
+        ),
+        ("surface_normal/0000.npy", np.ones((8, 12)), r"finite values \[H, W, 3\], got \[8, 12\]"),
+        (
+            "surface_normal/0000.npy",
+            np.ones((8, 12, 3), int),
+            r"finite values \[H, W, 3\], .* of int64",
+        ),
     ],
 )
 def test_one_line_for_what_is_broken(tmp_path, place, array, message):

@@ -67,9 +67,9 @@ def test_truth_that_is_not_there(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"alpha": None}, r"expected an array alpha \[H, W\], got albedo \[4, 6, 3\]"),
-        ({"alpha": np.zeros(3, np.uint8)}, r"expected an array alpha \[H, W\]"),
-        ({"albedo": np.zeros((HEIGHT, WIDTH))}, r"expected albedo of \[4, 6, 3\], got"),
+        ({"alpha": None}, r"expected an array alpha of shape \[H, W\], got albedo \[4, 6, 3\]"),
+        ({"alpha": np.zeros(3, np.uint8)}, r"expected an array alpha of shape \[H, W\]"),
+        ({"albedo": np.zeros((HEIGHT, WIDTH))}, r"expected albedo of size \[4, 6, 3\], got"),
         ({"roughness": np.full((HEIGHT, WIDTH), np.nan)}, "expected finite roughness"),
         ({"albedo": np.array([object()])}, "this npz file could not be read: .*pickle"),
     ],
@@ -119,7 +119,10 @@ def test_points(tmp_path):
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"vertices": np.eye(3)}, r"expected an array points \[P, 3\], got vertices \[3, 3\]"),
+        (
+            {"vertices": np.eye(3)},
+            r"expected an array points of shape \[P, 3\], got vertices \[3, 3\]",
+        ),
         ({"points": np.zeros((2, 2))}, r"got points \[2, 2\]"),
         ({"points": np.zeros((0, 3))}, r"got points \[0, 3\]"),
         ({"points": np.full((2, 3), np.inf)}, "points contain NaN or infinity"),

@@ -149,5 +149,8 @@ def test_no_points():
 
 def test_there_is_no_reference():
     mesh, scene = octahedron()
-    with use_backend("reference"), pytest.raises(RuntimeError, match="needs the native backend"):
+    with (
+        use_backend("reference"),
+        pytest.raises(RuntimeError, match="runs on the native backend only"),
+    ):
         shade(mesh, scene, WHITE, *sphere_points(2))
