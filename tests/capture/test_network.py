@@ -120,7 +120,8 @@ def test_the_time_is_told_once_it_is_measured(monkeypatch, caplog):
     assert caplog.messages == ["masks: using the network isnet-general-use (179 MB)"]
     for _ in range(2):
         assert torch.equal(masked(photograph()), photograph()[..., 0] / 255)
-    assert caplog.messages[1:] == ["masks: 5.1 s per photograph, about 5 min for all 60 photographs"]
+    told = "masks: 5.1 s per photograph, about 5 min for all 60 photographs"
+    assert caplog.messages[1:] == [told]
 
 
 def test_rembg_goes_first(home, monkeypatch, caplog):
