@@ -227,9 +227,9 @@ def set_level_(scene: Scene, problem: JointProblem, metal: Tensor, evidence: flo
         above = (ORDINARY / luminance(albedo[~metal]).mean()).clamp_min(1.0)
         factor = above ** (LEVEL / (LEVEL + evidence))
     scene.material.shift_albedo(features, factor * albedo.median(0).values)
-    problem.sky.log_radiance -= factor.log()
+    problem.sky.log_radiance.sub_(factor.log())
     if scene.flash is not None:
-        scene.flash.log_radiance -= factor.log()
+        scene.flash.log_radiance.sub_(factor.log())
 
 
 def with_metals(
