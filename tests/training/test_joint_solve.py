@@ -481,6 +481,19 @@ def test_bright_albedo_stays():
         torch.testing.assert_close(scene.material(features)[0], before)
 
 
+def test_metal_parts_bound_the_level(monkeypatch):
+    """They would come out brighter than any metal is."""
+    scene, problem = sphere_of((0.1, 0.1, 0.1), 0.5, 0.5)
+    features = scene.field.features_at(problem.observations.position)
+    with torch.no_grad():
+        scene.material.shift_albedo(features, torch.full((3,), 0.1))
+        monkeypatch.setattr(joint_solve, "ORDINARY_METAL", 0.15)
+        joint_solve.set_level_(scene, problem, torch.arange(len(features)) < 99, 0.0)
+        torch.testing.assert_close(
+            scene.material(features)[0].mean(), torch.tensor(0.15), rtol=0.01, atol=0
+        )
+
+
 def test_highlights_tell_the_level_and_roughness_hides_it():
     levels = {}
     for roughness in (0.2, 0.9):

@@ -84,6 +84,7 @@ METALLIC_WEIGHT = 0.01
 # else the brightest channel. It counts as much as photographs whose `NewtonRound.level` is LEVEL:
 # on the bank's tuning half, rough objects have 2e-4 to 4e-4, glossy ones 5e-3
 ORDINARY, ORDINARY_METAL, LEVEL = 0.35, 0.7, 1.7e-3
+FEW_METALS = 0.05  # share of the points up to which their brightness means nothing
 
 
 def solve(scene: Scene, photos: Photos, cfg: JointConfig, seed: int, progress: Progress) -> None:
@@ -226,6 +227,9 @@ def set_level_(scene: Scene, problem: JointProblem, metal: Tensor, evidence: flo
     else:
         above = (ORDINARY / luminance(albedo[~metal]).mean()).clamp_min(1.0)
         factor = above ** (LEVEL / (LEVEL + evidence))
+        if metal.float().mean() > FEW_METALS:  # their reflectance rises with the albedo of the rest
+            most = ORDINARY_METAL / albedo[metal].amax(1).mean()
+            factor = torch.minimum(factor, most.clamp_min(1.0))
     scene.material.shift_albedo(features, factor * albedo.median(0).values)
     problem.sky.log_radiance.sub_(factor.log())
     if scene.flash is not None:
