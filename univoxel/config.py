@@ -53,9 +53,7 @@ class StageConfig:
         )
     )
     iterations: int = field(metadata=about("number of steps; fewer run if time runs out", least=1))
-    share: float = field(
-        metadata=about("share of a time limit, relative to other stages", above=0, most=1)
-    )
+    share: float = field(metadata=about("weight of this stage in the time limit", above=0, most=1))
     rays: int = setting(2048, "rays per step", least=1)
     sharpness: tuple[float, float] = setting(
         (0.5, 0.3), "width s of the NeuS density at the start and the end", unit="voxels", above=0
@@ -125,7 +123,7 @@ class JointConfig:
     """Joint optimisation of one environment map, materials and normals: training/joint_solve.py."""
 
     iterations: int = setting(675, "total number of Adam steps; fewer if time runs out", least=1)
-    share: float = setting(0.27, "share of a time limit, relative to other stages", above=0, most=1)
+    share: float = setting(0.27, "weight of this stage in the time limit", above=0, most=1)
     rays: int = setting(2048, "number of observations per step; at least the value of views")
     views: int = setting(4, "number of observations of each point per step", least=1)
     rounds: int = setting(4, "rounds, each of Newton steps on the map and then Adam steps", least=1)
@@ -201,7 +199,7 @@ class TrainConfig:
     )
     patience: float = setting(
         0.0,
-        "end a stage if validation PSNR rises by less than this in 15 % of its steps; 0: never",
+        "end a stage if validation PSNR rises by less than this over 15 % of its steps; 0: never",
         unit="dB",
         least=0,
     )

@@ -218,10 +218,10 @@ def test_exr_with_nan_is_no_picture(tmp_path, bad):
 
 def test_exr_without_colours_is_no_picture(tmp_path):
     images.write_exr(tmp_path / "a.exr", {"depth": np.zeros((2, 2))})
-    with pytest.raises(DataError, match="expected channels R, G, B or Y, got depth"):
+    with pytest.raises(DataError, match="expected channels R, G, B, or Y, got depth"):
         images.read_image(tmp_path / "a.exr")
     images.write_exr(tmp_path / "a.exr", {"R": np.zeros((2, 2)), "G": np.zeros((2, 2))})
-    with pytest.raises(DataError, match="expected channels R, G, B or Y, got G, R"):
+    with pytest.raises(DataError, match="expected channels R, G, B, or Y, got G, R"):
         images.read_image(tmp_path / "a.exr")
 
 

@@ -141,7 +141,7 @@ def _steps(job: Job, watch: Callable[[Step], None]) -> tuple[Any, dict[str, str]
         code, said = _run(job, step, watch)
         seconds[step.name] = seconds.get(step.name, 0.0) + time.monotonic() - begin
         if (cause := system.ended_by(code)) is not None:
-            errors[step.name] = f"ended by {cause}; the system does this when memory runs out"
+            errors[step.name] = f"ended by {cause}; SIGKILL often means that memory runs out"
         elif code:
             errors[step.name] = said or f"ended with exit code {code}"
         elif step.makes is not None and not step.makes.exists():

@@ -23,7 +23,7 @@ class EnvmapOptions:
     height: Annotated[int, written("ROWS")] = MAP_ROWS
     """number of rows of the map, which has twice as many columns"""
     light_of: LightOf = None
-    """training view (name or number) whose light to write; see train --varying"""
+    """write the light of this training view (name or number), see train --varying"""
 
 
 @takes(EnvmapOptions)

@@ -233,7 +233,7 @@ def read_image(path: str | Path, in_srgb: bool = False, infinite: bool = False) 
         channels, stated = _read_exr(path)
         names = [c for c in "RGBA" if c in channels] if "R" in channels else ["Y"]
         if names not in (["R", "G", "B"], ["R", "G", "B", "A"], ["Y"]) or names[0] not in channels:
-            raise DataError(f"{path}: expected channels R, G, B or Y, got {', '.join(channels)}")
+            raise DataError(f"{path}: expected channels R, G, B, or Y, got {', '.join(channels)}")
         image = np.stack([channels[name] for name in names], -1)
         bad = np.isnan(image) | (image == -np.inf) if infinite else ~np.isfinite(image)
         if bad.any():
