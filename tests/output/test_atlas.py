@@ -54,6 +54,12 @@ def test_charts_are_those_that_the_package_xatlas_makes():
     torch.testing.assert_close(uv[[0, 300, -1]], torch.tensor(corners), rtol=0, atol=1e-5)
 
 
+def test_no_chart_goes_beyond_a_region(mesh, monkeypatch):
+    whole = len(unwrap(mesh, 256)[0])
+    monkeypatch.setattr("univoxel.ops.charts.REGION", 50)
+    assert len(unwrap(mesh, 256)[0]) > 1.1 * whole  # more seams
+
+
 def test_charts_of_a_face_without_its_vertex_are_refused():
     with pytest.raises(ValueError, match="charts: Index out of range"):
         unwrap(Mesh(torch.eye(3), torch.tensor([[0, 1, 3]])), 64)

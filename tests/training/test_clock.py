@@ -313,9 +313,10 @@ def test_time_left_is_right_from_the_measured_pace(tmp_path, clock):
     cfg = config(tmp_path, 0.5, 0.5, iterations=200, minutes=None)
     pace = 5 * expected_seconds(cfg.stages[0]) / 200
     progress, said = Progress(cfg, clock.now, START), []
+    progress.clock.afterwards = 7.0  # texture and page
     for _ in range(2):
         for _ in progress.clock.steps():
-            said.append((clock.now, progress.clock.remaining))
+            said.append((clock.now, progress.clock.remaining - 7.0))
             clock.now += pace
     end = clock.now
     for now, left in said[100:]:

@@ -230,6 +230,7 @@ def events(monkeypatch):
             "teach_albedo_": does("albedos"),
             "teach_mirrors_": does("mirrors"),
             "neutralise_": does("neutral"),
+            "set_level_": does("level"),
             "newton_round_": newton,
             "objective": adam,
         }.items():
@@ -287,7 +288,7 @@ OF_METAL = ["neutral", "newton, all metal", *METAL]
     ],
 )
 def test_what_a_round_does_and_when(events, told, options, wanted):
-    assert events(told, **options) == wanted
+    assert events(told, **options) == [*wanted, "level"]
 
 
 def test_training_says_and_keeps_that_there_is_nothing_but_metal(events, monkeypatch):
@@ -401,6 +402,7 @@ def test_a_solve_that_was_killed_goes_on_in_its_round(data, tmp_path, monkeypatc
     assert saved["stage"] == 1
     assert saved["stage_steps"] == 13  # saved before its step was counted
     assert saved["within"]["rounds_after"] == 1
+    assert saved["within"]["level"] > 0
     train_task.train(cfg, resume=True)
     assert started == [0]
     assert newtons[:2] == [0, 10]  # that of the second round is not made again

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 # Of preparation, a million pixels that are trained on, on two quiet cores of a Xeon
-PREPARATION_SECONDS = 1.0
+PREPARATION_SECONDS = 0.5
 PAGE_SECONDS = 8.0  # of the page, or the mesh, that follows a training
 SLACK = 0.05  # of a limit that training may take of what detail was left
 

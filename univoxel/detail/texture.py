@@ -235,7 +235,7 @@ def split(
 def make_detail(scene: Scene, photos: Photos, size: int | None = None) -> Detail | None:
     """The detail that photographs have beyond the model; None, with a line, where they have none.
 
-    One photograph is in memory at a time. Some are held out at first: where texture does not
+    Two photographs are in memory at a time. Some are held out at first: where texture does not
     predict them better than the model's own albedo does, there is no detail.
 
     Args:

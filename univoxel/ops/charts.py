@@ -212,7 +212,7 @@ def seen_at_texels(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """What `add_photograph_` looks up: the texels that count [N], colours [N, 3], values [N, 13].
 
-    Args: as there.
+    Args: as in `add_photograph_`.
     """
     some = shown[face].nonzero()[:, 0]
     at = between(values, corners[face[some]], corner_weights(barycentric[some].float()))

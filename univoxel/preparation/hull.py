@@ -143,12 +143,10 @@ def hull_sdf_reference(
         uv = pixel * (2 / torch.tensor(cameras.size(v))) - 1
         shown = cameras.cut(v, distance[v])
         uncut = _uncut(shown, wider)
-        d = (
-            -wider
-            + torch.nn.functional.grid_sample(
-                shown[None, None], uv[None, None], align_corners=False, padding_mode="border"
-            )[0, 0, 0]
+        d = torch.nn.functional.grid_sample(
+            shown[None, None], uv[None, None], align_corners=False, padding_mode="border"
         )
+        d = d[0, 0, 0] - wider
         seen = (depth > 0) & (uv.abs() <= 1).all(1)
         bound = d.clamp_min(0.5) if uncut else torch.full_like(d, -torch.inf)
         bound = torch.where(seen, d, bound) * depth.abs() / cameras.focal[v].mean()

@@ -80,10 +80,9 @@ ALBEDO_SMOOTHNESS = 0.005
 ROUGHNESS_SMOOTHNESS = 0.02
 # Weight of the cross entropy of metallic and the metal classification
 METALLIC_WEIGHT = 0.01
-# Mean albedo that things have: its luminance where they are not metal, below which it is raised,
-# else the brightest channel, which steel has so. It counts as much as photographs whose
-# `NewtonRound.level` is LEVEL: on the bank's tuning half, rough objects have 2e-4 to 4e-4, glossy
-# ones 5e-3
+# Mean luminance of an ordinary albedo, and the brightest channel of an ordinary metal, of steel. The
+# former counts as much as photographs whose `NewtonRound.level` is LEVEL: on the bank's tuning
+# half, the level is 2e-4 to 4e-4 for rough objects and 5e-3 for glossy ones
 ORDINARY, ORDINARY_METAL, LEVEL = 0.35, 0.55, 1.7e-3
 FEW_METALS = 0.05  # share of the points up to which their brightness means nothing
 
