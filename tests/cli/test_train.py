@@ -328,6 +328,9 @@ def test_a_limit_may_be_enough_for_the_steps_alone(caplog):
     task.announce(progress, photos)
     assert caplog.messages[-1].endswith("all steps, if preparation takes at most 30 s")
     assert clock.preparation == 30.0
+    clock.limit, clock.afterwards = 400.0, 600.0  # enough for the steps; texture and page follow
+    task.announce(progress, photos)
+    assert caplog.messages[-1].endswith("training takes about 16 min on this machine")
 
 
 def test_a_stage_without_a_step_is_said_and_ends_with_code_3(data, tmp_path, monkeypatch, capsys):

@@ -242,6 +242,16 @@ def test_stopped_in_a_stage_of_rounds_it_leaves_that(tmp_path, clock):
     assert (progress.clock.stage, progress.clock.made) == (1, [0.01])
 
 
+def test_texture_and_page_do_not_lengthen_a_stop(tmp_path, clock):
+    limits = []
+    for afterwards in (0.0, 1000.0):
+        progress = Progress(config(tmp_path, 1.0, minutes=None), clock.now, START)
+        progress.clock.afterwards = afterwards
+        progress.clock.finish()
+        limits.append(progress.clock.limit)
+    assert limits[0] == pytest.approx(limits[1])  # rounding of a sum
+
+
 def test_little_time_is_not_made_longer_by_a_stop(tmp_path, clock):
     progress = Progress(config(tmp_path, 0.5, 0.5, iterations=1000, minutes=0.2), clock.now, START)
     limit = progress.clock.limit

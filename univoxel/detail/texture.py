@@ -348,9 +348,10 @@ class _Baking:
         face, barycentric, *rest = texels
         some, color, at = seen_at_texels(face[::JUDGED], barycentric[::JUDGED], *rest)
         a, b, albedo, weight = at[:, :3], at[:, 3:6], at[:, 9:12], at[:, 12]
-        photo, known = linear_to_srgb(color), weight * (self.weights[JUDGED * some] > 0)
+        some = JUDGED * some  # of all texels
+        photo, known = linear_to_srgb(color), weight * (self.weights[some] > 0)
         sums = []
-        for value in (albedo, self._texture(JUDGED * some, albedo)):
+        for value in (albedo, self._texture(some, albedo)):
             error = (linear_to_srgb(a * value + b) - photo).square().mean(1)
             sums.append(float((known * error).double().sum() / known.double().sum()))
         return sums[0], sums[1]

@@ -80,7 +80,7 @@ ALBEDO_SMOOTHNESS = 0.005
 ROUGHNESS_SMOOTHNESS = 0.02
 # Weight of the cross entropy of metallic and the metal classification
 METALLIC_WEIGHT = 0.01
-# Mean luminance of an ordinary albedo, and the brightest channel of an ordinary metal, of steel. The
+# Mean luminance of an ordinary albedo, and the brightest channel of an ordinary metal (steel). The
 # former counts as much as photographs whose `NewtonRound.level` is LEVEL: on the bank's tuning
 # half, the level is 2e-4 to 4e-4 for rough objects and 5e-3 for glossy ones
 ORDINARY, ORDINARY_METAL, LEVEL = 0.35, 0.55, 1.7e-3
