@@ -49,6 +49,16 @@ struct Corners {
     }
 };
 
+template <class Stored>
+inline void sample(const Stored* picture, const Corners& around, const float* linear,
+                   float* color) {
+    for (int c = 0; c < 3; ++c) color[c] = 0;
+    for (int i = 0; i < 4; ++i) {
+        const Stored* stored = picture + 3 * around.at[i];
+        for (int c = 0; c < 3; ++c) color[c] += around.weight[i] * number(stored[c], linear);
+    }
+}
+
 /// Values [13] at a texel; false where the photograph does not show it.
 inline bool between_corners(const Texels& in, int64_t k, float* out) {
     const int64_t face = in.face[k];
@@ -95,7 +105,7 @@ void add_photograph(const Texels& in, const Stored* picture, float* total, float
     const float* m = in.matrix;
     parallel_for(in.K, kTexelsPerChunk, threads, [&](int64_t begin, int64_t end) {
         for (int64_t k = begin; k < end; ++k) {
-            float at[13], pixel[3], color[3] = {0, 0, 0};
+            float at[13], pixel[3], color[3];
             if (!between_corners(in, k, at)) continue;
             const float* place = at + 6;
             for (int i = 0; i < 3; ++i) {
@@ -108,14 +118,18 @@ void add_photograph(const Texels& in, const Stored* picture, float* total, float
             float cover = 0;
             for (int i = 0; i < 4; ++i) cover += beside.weight[i] * in.mask[beside.at[i]];
             if (!(cover > kInside)) continue;
-            const Corners around(in.scale * x, in.scale * y, in.W, in.H);
-            for (int i = 0; i < 4; ++i) {
-                const Stored* stored = picture + 3 * around.at[i];
-                for (int c = 0; c < 3; ++c) {
-                    color[c] += around.weight[i] * number(stored[c], in.linear);
-                }
-            }
+            sample(picture, Corners(in.scale * x, in.scale * y, in.W, in.H), in.linear, color);
             add(color, at, in, total + 3 * k, weights + k);
+        }
+    });
+}
+
+template <class Stored>
+void sample_picture(const Stored* picture, int64_t H, int64_t W, const float* linear,
+                    const float* place, int64_t N, float* colors, int threads) {
+    parallel_for(N, kTexelsPerChunk, threads, [&](int64_t begin, int64_t end) {
+        for (int64_t n = begin; n < end; ++n) {
+            sample(picture, Corners(place[2 * n], place[2 * n + 1], W, H), linear, colors + 3 * n);
         }
     });
 }
@@ -154,5 +168,9 @@ void rasterise(const float* uv, const int32_t* faces, int64_t F, int64_t size, i
 
 template void add_photograph(const Texels&, const uint8_t*, float*, float*, int);
 template void add_photograph(const Texels&, const float*, float*, float*, int);
+template void sample_picture(const uint8_t*, int64_t, int64_t, const float*, const float*, int64_t,
+                             float*, int);
+template void sample_picture(const float*, int64_t, int64_t, const float*, const float*, int64_t,
+                             float*, int);
 
 }  // namespace univoxel

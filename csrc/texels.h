@@ -27,6 +27,12 @@ template <class Stored>
 void add_photograph(const Texels& in, const Stored* picture, float* total, float* weights,
                     int threads);
 
+/// Linear colours [N, 3] of a picture [H, W, 3], sRGB bytes or linear, at places [N, 2] in pixels;
+/// `linear` is [256] of the bytes. Bilinear; beyond the border lies the border.
+template <class Stored>
+void sample_picture(const Stored* picture, int64_t H, int64_t W, const float* linear,
+                    const float* place, int64_t N, float* colors, int threads);
+
 /// Which face holds the centre of each texel of a texture's rows [top, top + rows); the last of
 /// several, -1 where none does.
 ///

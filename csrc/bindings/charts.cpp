@@ -76,6 +76,21 @@ void bind_chart_ops(py::module_& m) {
             rasterise(uv.data(), faces.data(), faces.size() / 3, owner.shape(1), top,
                       owner.shape(0), owner.mutable_data(), barycentric.mutable_data());
         });
+    def(m, "sample_picture", "picture linear place colors threads",
+        [](const std::variant<array<uint8_t>, array<float>>& picture, In<float> linear,
+           In<float> place, Out<float> colors, int threads) {
+            const int64_t n = place.size() / 2;
+            require(place.size() == 2 * n && colors.size() == 3 * n && linear.size() == 256,
+                    "sample_picture: sizes do not fit");
+            std::visit(
+                [&](const auto& a) {
+                    require(a.ndim() == 3 && a.shape(2) == 3 && a.size() > 0,
+                            "sample_picture: picture must be [H, W, 3]");
+                    sample_picture(a.data(), a.shape(0), a.shape(1), linear.data(), place.data(), n,
+                                   colors.mutable_data(), threads);
+                },
+                picture);
+        });
     def(m, "add_photograph",
         "face barycentric corners shown values matrix mask linear picture total weights scale "
         "clipped of_clipped threads",

@@ -24,7 +24,7 @@ from univoxel.core.records import Surface
 from univoxel.data import Photos
 from univoxel.detail import texture
 from univoxel.detail.texture import load_detail, make_detail, page_options, save_detail
-from univoxel.detail.views import DetailedViews, coherence, likeness
+from univoxel.detail.views import DetailedViews, coherence, likenesses
 from univoxel.errors import DataError
 from univoxel.evaluation.measures import render_layers
 from univoxel.output.mesh import bake
@@ -124,7 +124,7 @@ def test_novel_views_show_it(scene, photos, detail):
     opacity = surface.opacity.reshape(SIZE, SIZE)
     aided, alone = views.render(photos.cameras, VIEWS, coarse, opacity)
     photo, cover = photos.picture(VIEWS)
-    before, *after = (likeness(x, photo, cover) for x in (coarse, alone, aided))
+    before, *after = likenesses((coarse, alone, aided), photo, cover)
     assert before is not None
     assert coherence([before])[1] < 0.3
     for found in after:

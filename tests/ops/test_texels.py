@@ -1,9 +1,15 @@
-"""The albedo that photographs show at texels: the kernel is as the eager reference."""
+"""What photographs show at places, and of the albedo at texels: kernels are as the references."""
 
 import pytest
 import torch
 
-from univoxel.ops.charts import add_photograph_, add_photograph_reference_
+from univoxel.color import srgb_to_linear
+from univoxel.ops.charts import (
+    add_photograph_,
+    add_photograph_reference_,
+    sampled,
+    sampled_reference,
+)
 
 
 def texels(halves: bool):
@@ -53,3 +59,20 @@ def test_sizes_and_rows_are_checked():
         add_photograph_(total, weights, face + 1, *rest)
     with pytest.raises(ValueError, match="face must be"):
         add_photograph_(total, weights, face.long(), *rest)
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_pictures_are_sampled_as_by_the_reference(linear):
+    g = torch.Generator().manual_seed(0)
+    picture = torch.randint(0, 256, (23, 17, 3), generator=g).to(torch.uint8)
+    picture = picture.float() / 200 if linear else picture
+    place = torch.rand(500, 2, generator=g) * torch.tensor([25.0, 31.0]) - 4  # some are beyond
+    torch.testing.assert_close(
+        sampled(picture, place), sampled_reference(picture, place), rtol=1e-4, atol=1e-5
+    )
+    middle = torch.tensor([[5.5, 7.5]])
+    same = picture[7, 5] if linear else srgb_to_linear(picture[7, 5] / 255)
+    torch.testing.assert_close(sampled(picture, middle)[0], same)
+    assert sampled(picture, place[:0]).shape == (0, 3)
+    turned = picture.transpose(0, 1)  # not contiguous
+    torch.testing.assert_close(sampled(turned, middle), sampled(turned.contiguous(), middle))

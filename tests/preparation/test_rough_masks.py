@@ -5,15 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from analytic import RADIUS, photos_of
+from analytic import RADIUS, look_at, photos_of
+from scipy.spatial.transform import Rotation
 
 from lab.stress.damage import turned
+from univoxel.camera import Cameras
 from univoxel.data import Photos
 from univoxel.errors import DataError
+from univoxel.fields.grid import fit_grid
 from univoxel.preparation import pose_refinement, prepare
 from univoxel.preparation.hull import hull_sdf, mask_distances
+from univoxel.preparation.object_shape import ObjectShape, silhouettes
 from univoxel.preparation.pose_refinement import MAX_CONTRADICTION, Belief, choose_masks_or_poses
-from univoxel.preparation.rough_masks import doubt_masks, thick
+from univoxel.preparation.rough_masks import doubt_masks, thick, undo_moves_
+from univoxel.preparation.stereo import DepthMaps
 from univoxel.presets import preset
 
 VIEWS, SIZE = 24, 96
@@ -138,3 +143,56 @@ def test_preparation_doubts_what_contradicts_and_starts_from_what_agrees(
         asked = replace(found, shape=replace(found.shape, surface=surface))
         prepare.prepare(asked, cfg)
         assert len(carved) == (surface == 0)
+
+
+def turned_over(first: int, second: int) -> Cameras:
+    """Two rings of level cameras: the object was turned over between them."""
+    angle = 2 * torch.pi * torch.cat([torch.arange(n) / n for n in (first, second)])
+    place = torch.stack([angle.cos(), angle.sin(), torch.full_like(angle, 0.5)], 1)
+    poses = torch.stack([look_at(3 * p) for p in place])
+    over = torch.from_numpy(Rotation.from_rotvec([2.8, 0.2, 0.0]).as_matrix()).float()
+    poses[first:] = over @ poses[first:]
+    focal = torch.full((first + second, 2), 160.0)
+    return Cameras(poses, focal, torch.full_like(focal, SIZE / 2), SIZE, SIZE)
+
+
+def ball_with_a_lid(cameras: Cameras, lid: tuple[float, float, float]) -> list[torch.Tensor]:
+    """Masks [SIZE, SIZE] of a ball, and of a small one beside it."""
+    grid = fit_grid(*BOX, 64**3)
+    small = 0.18 - (grid.nodes() - torch.tensor(lid)).norm(dim=-1)
+    shape = ObjectShape(grid, torch.maximum(0.4 - grid.nodes().norm(dim=-1), small), 0.0)
+    return [shown.float() for shown in silhouettes(shape, cameras)]
+
+
+def moved_in(
+    cameras: Cameras, masks: list[torch.Tensor]
+) -> tuple[list[torch.Tensor], list[torch.Tensor], torch.Tensor]:
+    """What `undo_moves_` finds, the masks that it leaves, and where depth stays known."""
+    maps = DepthMaps(cameras, torch.ones(len(masks), SIZE, SIZE), torch.ones(1).bool(), 0.1)
+    known, masks = torch.ones(len(masks), SIZE, SIZE, dtype=torch.bool), list(masks)
+    return undo_moves_(masks, replace(maps, known=known), BOX), masks, known
+
+
+def test_a_part_that_moved_stays_where_most_photographs_show_it(caplog):
+    cameras = turned_over(16, 12)
+    here, there = (ball_with_a_lid(cameras, lid) for lid in ((0.5, 0.0, 0.0), (0.0, 0.5, 0.0)))
+    with caplog.at_level("INFO"):
+        moved, masks, known = moved_in(cameras, here[:16] + there[16:])
+    assert "12 of 28 photographs show it elsewhere" in caplog.text
+    assert not any(pixels.any() for pixels in moved[:16])
+    for view, (made, true) in enumerate(zip(masks, here, strict=True)):
+        assert not thick(made != true).any()
+        assert torch.equal(known[view], ~moved[view])
+    for shown, true, pixels in zip(there[16:], here[16:], moved[16:], strict=True):
+        assert pixels[shown != true].float().mean() > 0.9
+
+
+def test_nothing_moves_where_all_photographs_agree_or_no_position_is_known():
+    cameras = turned_over(16, 12)
+    same = ball_with_a_lid(cameras, (0.5, 0.0, 0.0))
+    assert not any(pixels.any() for pixels in moved_in(cameras, same)[0])
+    only = cameras.of(torch.arange(16))
+    assert not any(pixels.any() for pixels in moved_in(only, same[:16])[0])
+    # Where most of the object seems to have moved, cameras are wrong
+    masks = same[:16] + [torch.roll(mask, 25, 1) for mask in same[16:]]
+    assert not any(pixels.any() for pixels in moved_in(cameras, masks)[0])

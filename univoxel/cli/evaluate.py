@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from univoxel.cli import parsing
-from univoxel.core import log
 from univoxel.core.choices import BOUNCES, SAMPLES, Behind
 from univoxel.core.files import write_json
 from univoxel.errors import UserError
@@ -99,7 +98,7 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
     from statistics import fmean
 
     from univoxel.detail.texture import albedo_near
-    from univoxel.detail.views import measure_full_size
+    from univoxel.detail.views import detailed_views, measure_full_size
     from univoxel.evaluation import views
     from univoxel.evaluation.measures import (
         albedo_scales,
@@ -131,7 +130,8 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
     scales = albedo_scales(scene, photos, near)
     relighting = views.relighting_of(scene, mesh, truth, scales, asked.samples, asked.bounces)
     how = {"background": asked.background, "fit_light": asked.fit_light, "save": save}
-    how |= {"albedo_near": near}
+    detailed = detailed_views(scene, run, data)
+    how |= {"albedo_near": near, "novel": detailed and detailed.render}
     found = views.measure_views(scene, photos, truth, scales, relighting, surveyed, **how)
     result = {key: fmean(values) if values else None for key, values in found.measures.items()}
     result |= {
@@ -146,14 +146,7 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
         "model_bytes": (run / FILE).stat().st_size,
     }
     if asked.full_size:
-        try:
-            train = photos_of(run, data, "train")
-        except (UserError, OSError) as error:  # views are the model's only
-            log.info(
-                "full size: no photographs found, so novel views use only the model: %s", error
-            )
-            train = None
-        result |= measure_full_size(scene, run, photos, train, save)
+        result |= measure_full_size(scene, detailed, photos, save)
     figures = views.say_trust(surveyed, report.get("troubles", []), save)
     if json:
         verdict = load_verdict(run)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from univoxel.camera import Cameras
 from univoxel.color import srgb_to_linear
+from univoxel.core import memmap
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,13 @@ class Photos:
         return replace(
             self, names=names, color=color, alpha=alpha, cameras=cameras, readers=readers
         )
+
+    def without(self, pixels: Tensor) -> Photos:
+        """The same with no object at pixels [V, H, W] bool."""
+        alpha = memmap.zeros(self.alpha.shape, self.alpha.dtype)
+        for view in range(len(self)):
+            alpha[view] = self.alpha[view].masked_fill(pixels[view], 0)
+        return replace(self, alpha=alpha)
 
     def coverage(self) -> Tensor:
         """Alpha of all pixels [V, H, W], float32 in [0, 1]; 0 beyond a picture."""

@@ -109,11 +109,11 @@ class Detail:
 
     @cached_property
     def levels(self) -> list[Tensor]:
-        """The texture, and means over squares of 2, 4 and so on of its texels: [3, T, T] uint8."""
-        levels = [self.albedo.movedim(-1, 0)]
-        while levels[-1].shape[-1] > SIZES[0]:
-            half = [avg_pool2d(LINEAR[c.int()][None], 2)[0] for c in levels[-1]]
-            levels.append((255 * linear_to_srgb(torch.stack(half))).round().to(torch.uint8))
+        """The texture, and means over squares of 2, 4 and so on of its texels: [T, T, 3] uint8."""
+        levels = [self.albedo]
+        while len(levels[-1]) > SIZES[0]:
+            half = [avg_pool2d(LINEAR[c.int()][None], 2)[0] for c in levels[-1].unbind(-1)]
+            levels.append((255 * linear_to_srgb(torch.stack(half, -1))).round().to(torch.uint8))
         return levels
 
     def at(self, face: Tensor, barycentric: Tensor, footprint: float = 0.0) -> Tensor:
@@ -125,7 +125,7 @@ class Detail:
         """
         uv = between(self.uv, self.corners[face], barycentric)
         level = int(math.log2(max(footprint / self.texel, 1)))
-        picture = self.levels[min(level, len(self.levels) - 1)].movedim(0, -1)
+        picture = self.levels[min(level, len(self.levels) - 1)]
         place = torch.stack([uv[:, 0], 1 - uv[:, 1]], 1) * len(picture)
         return sampled(picture, place)
 

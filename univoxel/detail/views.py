@@ -11,8 +11,12 @@ Source: Buehler et al. 2001, "Unstructured Lumigraph Rendering", for the weights
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import repeat
 from pathlib import Path
 from statistics import fmean
 
@@ -24,6 +28,7 @@ from torch.nn.functional import interpolate, normalize
 
 from univoxel.camera import Cameras, pixel_rays, pixel_width, project, resize
 from univoxel.color import linear_to_srgb
+from univoxel.core import log
 from univoxel.core.progress_bar import track
 from univoxel.core.records import Mesh
 from univoxel.data import Photos
@@ -37,10 +42,13 @@ from univoxel.detail.texture import (
     split,
     vertices_of,
 )
+from univoxel.errors import UserError
 from univoxel.evaluation.measures import render_layers
+from univoxel.ops import native
 from univoxel.ops.charts import between, corner_weights, linear, sampled
 from univoxel.render.metrics import ssim
 from univoxel.render.pipeline import at_rays
+from univoxel.run import photos_of
 from univoxel.scene import Scene
 
 NEAREST = 6  # photographs that a view is put right by
@@ -208,6 +216,26 @@ class DetailedViews:
         return self._kept[view]
 
 
+def detailed_views(scene: Scene, run: Path, data: Path | None) -> DetailedViews | None:
+    """What renders the views of a run with its detail; None: it has none.
+
+    Args:
+        data: as in `univoxel.run.photos_of`. Where no photographs are found, views are the model's.
+
+    Raises:
+        DataError: as `load_detail`.
+    """
+    detail = load_detail(run)
+    if detail is None:
+        return None
+    try:
+        train = photos_of(run, data, "train")
+    except (UserError, OSError) as error:
+        log.info("no training photographs found, so novel views use only the model: %s", error)
+        train = None
+    return DetailedViews(scene, detail, train)
+
+
 def _shrunk(picture: Tensor, scale: float) -> Tensor:
     """A stored picture [H, W, 3] of `scale` times the size, < 1, linear where it was not."""
     planes = linear(picture).movedim(-1, 0)
@@ -239,9 +267,9 @@ class Likeness:
     photo: np.ndarray  # of the photograph's square
 
 
-def likeness(picture: Tensor, photo: Tensor, cover: Tensor) -> Likeness | None:
-    """How like a picture [H, W, 3] is to a photograph, both linear, where `cover` [H, W] is the
-    object; None if too little of it is.
+def likenesses(pictures: Sequence[Tensor], photo: Tensor, cover: Tensor) -> list[Likeness]:
+    """How like pictures [H, W, 3] are to a photograph, all linear, where `cover` [H, W] is the
+    object; empty if too little of it is.
 
     The object is made smaller by EDGE, so that its silhouette does not count. Octave k is the
     difference of the grey values under Gaussians of 0.85 2^(k-1) and 0.85 2^k pixels: periods of
@@ -250,24 +278,29 @@ def likeness(picture: Tensor, photo: Tensor, cover: Tensor) -> Likeness | None:
     edge = max(2, round(EDGE * cover.shape[1]))
     inside = np.asarray(binary_erosion((cover > 0.99).numpy(), iterations=edge), bool)
     if inside.sum() < 1000:
-        return None
+        return []
     rows, columns = (np.flatnonzero(inside.any(axis)) for axis in (1, 0))
     box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
     inside = inside[box]
-    truth, made = (linear_to_srgb(x[box]).numpy() for x in (photo, picture))
-    made = np.where(inside[..., None], made, truth)
-    truth_in, made_in = truth[inside], made[inside]
-    gain = (truth_in * made_in).sum(0) / np.maximum((made_in**2).sum(0), 1e-9)
-    made = made * gain.astype(np.float32)
-    psnr = -10 * np.log10(max(float(((truth - made)[inside] ** 2).mean()), 1e-12))
-    sums = np.zeros((3, OCTAVES))
-    before = grey = [x @ np.array([0.299, 0.587, 0.114], np.float32) for x in (truth, made)]
-    for k in range(OCTAVES):
-        after = [gaussian_filter(x, FINEST * 2**k) for x in grey]
-        one, two = ((b - a)[inside].astype(np.float64) for b, a in zip(before, after, strict=True))
-        sums[:, k] = (one * two).sum(), (two * two).sum(), (one * one).sum()
-        before = after
-    return Likeness(float(psnr), *sums)
+    truth, *others = (linear_to_srgb(x[box]).numpy() for x in (photo, *pictures))
+    made, quality = [], []
+    for other in others:
+        gain = (truth * other)[inside].sum(0) / np.maximum((other[inside] ** 2).sum(0), 1e-9)
+        made.append(np.where(inside[..., None], other, truth) * gain.astype(np.float32))
+        error = float(((truth - made[-1])[inside] ** 2).mean())
+        quality.append(-10 * math.log10(max(error, 1e-12)))
+    sums = np.zeros((len(made), 3, OCTAVES))
+    before = grey = [x @ np.array([0.299, 0.587, 0.114], np.float32) for x in (truth, *made)]
+    with ThreadPoolExecutor(native.threads()) as pool:
+        for k in range(OCTAVES):
+            after = list(pool.map(gaussian_filter, grey, repeat(FINEST * 2**k)))
+            band, *own = (
+                (b - a)[inside].astype(np.float64) for b, a in zip(before, after, strict=True)
+            )
+            for sum_, one in zip(sums, own, strict=True):
+                sum_[:, k] = (band * one).sum(), (one * one).sum(), (band * band).sum()
+            before = after
+    return [Likeness(psnr, *sum_) for psnr, sum_ in zip(quality, sums, strict=True)]
 
 
 def coherence(found: list[Likeness]) -> list[float]:
@@ -278,18 +311,14 @@ def coherence(found: list[Likeness]) -> list[float]:
 
 @torch.no_grad()
 def measure_full_size(
-    scene: Scene, run: Path, test: Photos, train: Photos | None, save: Path | None
+    scene: Scene, views: DetailedViews | None, test: Photos, save: Path | None
 ) -> dict[str, float | None]:
     """Novel views at the size of their photographs' files against these, by `FULL_MEASURES`.
 
-    Without detail in the run, and without files of the photographs, views are enlarged.
-
     Args:
-        train: the photographs that views are put right by; None: none are.
+        views: None: views are enlarged.
         save: folder for NAME_full.exr, the view as half floats: rgb.*, linear on black, and alpha.
     """
-    detail = load_detail(run)
-    views = None if detail is None else DetailedViews(scene, detail, train)
     found: tuple[list[Likeness], list[Likeness]] = ([], [])
     similar: list[float] = []
     for view in track(range(len(test) if test.readers else 0), "full size"):
@@ -304,9 +333,9 @@ def measure_full_size(
         else:
             aided, alone = views.render(cameras, 0, layers.rgb, layers.alpha)
         both = torch.minimum(cover, alpha)
-        for measured, picture in zip(found, (aided, alone), strict=True):
-            if (likeness_ := likeness(picture, photo, both)) is not None:
-                measured.append(likeness_)
+        like = likenesses((aided, alone), photo, both)  # none, if little of the object is seen
+        for measured, one in zip(found, like, strict=False):
+            measured.append(one)
         similar.append(ssim(linear_to_srgb(aided), linear_to_srgb(photo * cover[..., None])))
         if save:
             channels = {f"rgb.{c}": aided[..., k] for k, c in enumerate("RGB")}

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from univoxel.camera import Cameras
 from univoxel.color import linear_to_srgb
 from univoxel.core import log
 from univoxel.core.choices import Behind
@@ -81,6 +83,7 @@ def measure_views(
     fit_light: bool,
     save: Path | None,
     albedo_near: AlbedoNear | None = None,
+    novel: Callable[[Cameras, int, Tensor, Tensor], tuple[Tensor, Tensor]] | None = None,
 ) -> ViewMeasures:
     """Render and measure all test views; write their layers and the contact sheet into `save`.
 
@@ -88,6 +91,7 @@ def measure_views(
         background: what novel views are compared with photographs on.
         fit_light: each is rendered in the light that fits its photograph.
         albedo_near: as in `render_layers`.
+        novel: `DetailedViews.render` of the detail that the run has; None: it has none.
     """
     errors = ExpectedErrors(surveyed) if surveyed else None
     found = ViewMeasures({key: [] for key in MEASURES}, {name: [] for name in QUANTITIES})
@@ -97,6 +101,9 @@ def measure_views(
         if fit_light:
             fit_light_(scene, photos, view, albedo_near)
         layers = render_layers(scene, photos.cameras, view, relighting, errors, albedo_near)
+        if novel is not None:
+            rgb = novel(photos.cameras, view, layers.rgb, layers.alpha)[0]
+            layers = replace(layers, rgb=rgb)
         expected = expected_view(photos, truth.relit, view, background)
         for key, value in score(layers, expected, scales):
             found.measures[key].append(value)

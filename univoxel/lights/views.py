@@ -276,7 +276,7 @@ class Turntable(Table):
         if only is not None and (up @ up.new_tensor(only.axis) < 0).sum() < FEWEST:
             return Turntable(only.point, only.axis, only.start)
         tables = []
-        for which in _laid(cameras):
+        for which in positions_of(cameras):
             table = Table.of(cameras.of(which))
             if table is None:
                 return None
@@ -325,10 +325,10 @@ def _vec3(vector: Tensor) -> Vec3:
     return x, y, z
 
 
-def _laid(cameras: Cameras) -> list[Tensor]:
-    """Indices of the cameras of each way in which the object lay, in order; none: they do not say.
+def positions_of(cameras: Cameras) -> list[Tensor]:
+    """Indices of the cameras of each position of the object, in order; none: they do not say.
 
-    Cameras are level: all that saw it lying one way have their right axes across what was up then.
+    Cameras are level: all that saw one position have their right axes across what was up then.
     """
     right, up = cameras.camera_to_world[:, :, 0], cameras.camera_to_world[:, :, 1]
     generator = torch.Generator().manual_seed(0)

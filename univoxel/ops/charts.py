@@ -108,18 +108,20 @@ def sampled(picture: Tensor, place: Tensor) -> Tensor:
         picture: [H, W, 3] uint8 sRGB, or float32 linear.
         place: [N, 2] x to the right and y down, in pixels; a pixel's centre is at a half.
     """
-    height, width = picture.shape[:2]
-    if not len(place):
-        return torch.zeros(0, 3)
-    # What is asked for, with a pixel around it
-    low = (place.amin(0).floor().int() - 1).tolist()
-    high = (place.amax(0).ceil().int() + 1).tolist()
-    x, y = (min(max(n, 0), size - 1) for n, size in zip(low, (width, height), strict=True))
-    part = linear(picture[y : max(high[1], y + 1), x : max(high[0], x + 1)])
-    size = torch.tensor([part.shape[1], part.shape[0]])
-    at = 2 * (place - torch.tensor([x, y])) / size - 1
-    planes = part.movedim(-1, 0)[None]
-    found = grid_sample(planes, at[None, None], padding_mode="border", align_corners=False)
+    if not native.serves(place):
+        return sampled_reference(picture, place)
+    colors = torch.empty(len(place), 3)
+    stored, *arrays = (t.contiguous() for t in (picture, LINEAR, place))
+    native.require().sample_picture(*native.arrays(stored, *arrays, colors), native.threads())
+    return colors
+
+
+def sampled_reference(picture: Tensor, place: Tensor) -> Tensor:
+    """Reference in eager PyTorch."""
+    size = torch.tensor([picture.shape[1], picture.shape[0]])
+    at = (2 * place / size - 1)[None, None]
+    planes = linear(picture).movedim(-1, 0)[None]
+    found = grid_sample(planes, at, padding_mode="border", align_corners=False)
     return found[0, :, 0].T
 
 

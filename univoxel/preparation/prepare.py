@@ -308,11 +308,12 @@ def prepare(
         hull = torch.maximum(hull, signed_distance(silhouettes.shape, grid))
     begins("exposures", needed=True)
     say_clipped(photos)
-    varying, gains = varying_and_gains(photos, hull, grid, cfg.scene.varying, cfg.exposures)
-    frame = light_frame_of(photos, hull, grid, cfg.light_frame, gains)
+    known = photos if silhouettes.doubted is None else photos.without(silhouettes.doubted)
+    varying, gains = varying_and_gains(known, hull, grid, cfg.scene.varying, cfg.exposures)
+    frame = light_frame_of(known, hull, grid, cfg.light_frame, gains)
     # A light for each photograph is one that differs from point to point, in the world
     may_vary = cfg.exposures and isinstance(cfg.scene.light, LocalLightConfig)
-    if may_vary and frame == LightFrame() and varied_light(photos, hull, grid, gains) > VARIED:
+    if may_vary and frame == LightFrame() and varied_light(known, hull, grid, gains) > VARIED:
         varying = "light"
         log.info(
             "light differs between photographs, so each gets a light of its own; varying=none "

@@ -1,8 +1,12 @@
 """Correction of inconsistent masks with the shape that photographs and masks agree on.
 
 Where a mask and the object's silhouette differ by more than a jagged edge, nothing is known: the
-pixel tells neither of the object nor of emptiness. A part that was moved between photographs, such
-as a lid, is doubted in those that disagree with the others.
+pixel tells neither of the object nor of emptiness.
+
+A part may have moved when the object was turned over, such as a lid or a limb. Then photographs of
+each position of the object agree with one another, but not with those of another position. The
+model has the part where most photographs show it. The others tell nothing of that place, and
+nothing of where they show the part.
 """
 
 from __future__ import annotations
@@ -16,23 +20,42 @@ from scipy import ndimage
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from univoxel.camera import Cameras
+from univoxel.camera import Cameras, image_rays, stacked
 from univoxel.core import log, memmap
 from univoxel.core.memmap import parallel_map
 from univoxel.data import Photos
 from univoxel.data.photos import coverage_of
-from univoxel.preparation.hull import estimate_bounds, mask_distances
-from univoxel.preparation.object_shape import ObjectShape, find_object, shrunk, silhouettes
+from univoxel.fields.distances import DenseDistances
+from univoxel.fields.grid import GridShape, fit_grid, resample
+from univoxel.lights.views import positions_of
+from univoxel.ops import VisibilityScene
+from univoxel.preparation.hull import (
+    estimate_bounds,
+    mask_distances,
+    visual_hull,
+    votes_needed,
+)
+from univoxel.preparation.object_shape import (
+    ObjectShape,
+    find_object,
+    shrunk,
+    silhouettes,
+)
 from univoxel.preparation.pose_refinement import MAX_CONTRADICTION, Belief, contradiction
-from univoxel.preparation.stereo import DepthMaps, depth_maps
+from univoxel.preparation.stereo import DepthMaps, depth_maps, pixels_of
 
 # Half the width, in pixels of the depth maps, of what a mask lacks or shows too much before it is
 # doubted: narrower pieces are its jagged edge
 JAGGED = 2.0
-# How many times as many pixels of the masks as without depth an object may contradict with it. Of
-# a tankard, whose depth is right, it was 1.1, of five scenes in which it made silhouettes worse 1.3
-# to 3.2
-CLEARLY = 1.2
+# Voxels along a side of the grid, on average, on which parts that moved are looked for
+VOXELS = 96
+# Share of the photographs of a position whose masks show a place beyond the hull of all: somewhere
+# in a part that moved, and everywhere in it
+CORE, WHOLE = 0.2, 0.05
+# Voxels around these places: most of such a part lies in the hulls of both positions
+NEAR = 4
+# Share of the object that a part is at least and at most: where cameras are wrong, more moves
+LEAST_PART, MOST_PART = 0.001, 0.2
 
 
 @dataclass(frozen=True)
@@ -57,11 +80,12 @@ def doubt_masks(photos: Photos, distance: Tensor, belief: Belief) -> Doubted:
     """
     cameras, maps = photos.cameras, depth_maps(photos)
     masks = parallel_map(lambda view: small_mask(photos, view, maps.cameras), range(len(photos)))
+    moved = undo_moves_(masks, maps, belief.box)
     shape, shown = best_object(masks, maps)
     pixels = memmap.zeros(photos.alpha.shape, torch.bool)
 
     def doubt_(view: int) -> None:
-        doubted = thick((masks[view] >= 0.5) != shown[view])
+        doubted = thick((masks[view] >= 0.5) != shown[view]) | moved[view]
         own = cameras.cut(view, pixels[view])
         own.copy_(interpolate(doubted[None, None].float(), own.shape)[0, 0] > 0)
 
@@ -83,22 +107,92 @@ def doubt_masks(photos: Photos, distance: Tensor, belief: Belief) -> Doubted:
     return Doubted(shape, pixels, replace(belief, box=box, votes=votes, off=off))
 
 
-def best_object(masks: Sequence[Tensor], maps: DepthMaps) -> tuple[ObjectShape, list[Tensor]]:
-    """The object with its depth or as masks alone show it, whichever fits the masks [H, W] better;
-    and its silhouettes [h, w] bool.
+def undo_moves_(masks: list[Tensor], maps: DepthMaps, box: tuple[Tensor, Tensor]) -> list[Tensor]:
+    """Where photographs show a part elsewhere than most do: V times [h, w] bool. There, masks
+    become those of the part in its place, and depths unknown.
 
-    Depth tells of hollows, and of what most masks lack or show too much. But in a mirror it is that
-    of the reflection: then the object's silhouettes lose what all masks show.
+    Args:
+        masks: V, [h, w] in [0, 1] of the sizes of the depth maps.
+        box: corners [3], [3] around the object.
     """
+    cameras, moved = maps.cameras, [torch.zeros_like(mask, dtype=torch.bool) for mask in masks]
+    positions = sorted(positions_of(cameras), key=len, reverse=True)
+    if len(positions) < 2:
+        return moved
+    grid, distance = fit_grid(*box, VOXELS**3), mask_distances(stacked(masks), cameras)
+    hulls = [visual_hull(distance[p], cameras.of(p), grid, votes_needed(len(p))) for p in positions]
+    for hull, position in zip(hulls[1:], positions[1:], strict=True):
+        shared = torch.maximum(hulls[0], hull)
+        if not (shared < 0).any():
+            continue
+        shown = silhouettes(ObjectShape(grid, -shared, 0.0), cameras)
+        beyond = [thick((mask >= 0.5) & ~one) for mask, one in zip(masks, shown, strict=True)]
+        stays = part_beyond(beyond, cameras, positions[0], grid, (hulls[0] < 0) & (hull >= 0))
+        moves = part_beyond(beyond, cameras, position, grid, (hull < 0) & (hulls[0] >= 0))
+        sizes = [int(part.sum()) / int((shared < 0).sum()) for part in (stays, moves)]
+        log.debug("parts beyond the hull of both positions: %.4f and %.4f of it", *sizes)
+        if not all(LEAST_PART < size < MOST_PART for size in sizes):
+            continue
+        log.info(
+            "a part moved when the object was turned over: %d of %d photographs show it elsewhere "
+            "and are ignored there",
+            *(len(position), len(masks)),
+        )
+        whole = torch.where(stays, -grid.voxel_size, shared)
+        joined = torch.where(moves, -grid.voxel_size, whole)
+        both = VisibilityScene(*DenseDistances(grid, joined).isosurface())
+        near = torch.from_numpy(ndimage.binary_dilation((stays | moves).numpy(), iterations=NEAR))
+        shown = list(silhouettes(ObjectShape(grid, -whole, 0.0), cameras))
+        for view in position.tolist():
+            rays = image_rays(cameras, view)
+            t = both.closest_hit(rays.origin, rays.direction).t
+            met = t.isfinite().nonzero()[:, 0]
+            place = rays.origin[met] + t[met, None] * rays.direction[met]
+            x, y, z = ((place - grid.bounds()[0]) / grid.voxel_size).round().long().unbind(1)
+            there = beyond[view].clone()
+            there.view(-1)[met] |= near[x, y, z]
+            moved[view] |= there
+            masks[view] = torch.where(there, shown[view].float(), masks[view])
+            cameras.cut(view, maps.known[view])[there] = False
+    return moved
+
+
+def part_beyond(
+    beyond: Sequence[Tensor], cameras: Cameras, views: Tensor, grid: GridShape, among: Tensor
+) -> Tensor:
+    """The connected nodes [X, Y, Z] bool that some views [N] show beyond a hull.
+
+    Args:
+        beyond: V, [h, w] bool, what masks show there.
+        among: [X, Y, Z] bool, nodes that may be.
+    """
+    index = among.flatten().nonzero()[:, 0]
+    nodes, count = grid.nodes().view(-1, 3)[index], torch.zeros(len(index))
+    for view in views.tolist():
+        row, column, seen = pixels_of(cameras, view, nodes)
+        count += seen & beyond[view][row, column]
+    share = torch.zeros(grid.size)
+    share.view(-1)[index] = count / len(views)
+    parts = torch.from_numpy(np.asarray(ndimage.label((share >= WHOLE).numpy())[0]))
+    return torch.isin(parts, parts[share >= CORE].unique())
+
+
+def best_object(masks: Sequence[Tensor], maps: DepthMaps) -> tuple[ObjectShape, list[Tensor]]:
+    """The object as masks alone show it, or what depth leaves of that, whichever fits the masks
+    [H, W] better, jagged edges aside; and its silhouettes [h, w] bool.
+
+    Depth tells of hollows, and of what most masks show too much. But in a mirror it is that of the
+    reflection: then the object's silhouettes lose what all masks show.
+    """
+    by_masks = find_object(masks, replace(maps, known=torch.zeros_like(maps.known)))
+    by_depth = find_object(masks, maps)
+    both = torch.minimum(by_depth.inside, resample(by_masks.inside, by_masks.grid, by_depth.grid))
     found = []
-    for known in (maps.known, torch.zeros_like(maps.known)):
-        shape = find_object(masks, replace(maps, known=known))
+    for shape in (replace(by_depth, inside=both), by_masks):
         shown = list(silhouettes(shape, maps.cameras))
-        differs = [(mask >= 0.5) != one for mask, one in zip(masks, shown, strict=True)]
+        differs = [thick((m >= 0.5) != one) for m, one in zip(masks, shown, strict=True)]
         found.append((shape, shown, sum(int(one.sum()) for one in differs)))
-    (with_depth, without) = found
-    best = with_depth if with_depth[2] <= CLEARLY * without[2] else without
-    return best[:2]
+    return min(found, key=lambda one: one[2])[:2]
 
 
 def thick(differs: Tensor) -> Tensor:

@@ -36,6 +36,7 @@ def silhouette(opacity: Tensor, alpha: Tensor) -> Tensor:
 
 BEST_PSNR = 100.0  # dB, where pictures are equal: keeps means finite
 BLACK, BLACK_TRUTH = 1e-4, 1e-3  # linear: albedo below has no ratio, estimated and true
+HALF_WINDOW = 5  # pixels from the middle of a window of SSIM to its side
 ENOUGH = 0.01  # share of the pixels that have to have a ratio in a channel
 
 
@@ -72,16 +73,29 @@ def ssim(picture: Tensor, truth: Tensor) -> float:
     _same_size("ssim", picture, truth)
     if min(picture.shape[:2]) < 11:
         raise UserError(f"ssim: expected at least 11x11 pixels, got {list(picture.shape[:2])}")
-    similarity = structural_similarity(
-        picture.double().numpy(),
-        truth.double().numpy(),
+    differs = (picture != truth).any(-1)
+    if not differs.any():
+        return 1.0
+    # Where all of a window is equal, pictures are similar by 1
+    height, width = differs.shape
+    top, left = (max(int(n.min()) - 2 * HALF_WINDOW, 0) for n in differs.nonzero(as_tuple=True))
+    bottom, right = (int(n.max()) + 2 * HALF_WINDOW + 1 for n in differs.nonzero(as_tuple=True))
+    found = structural_similarity(
+        picture[top:bottom, left:right].double().numpy(),
+        truth[top:bottom, left:right].double().numpy(),
         data_range=1.0,
         channel_axis=-1,
         gaussian_weights=True,
         sigma=1.5,
         use_sample_covariance=False,
+        full=True,
     )
-    return float(np.asarray(similarity))
+    similarity = np.asarray(found[1])
+    # Windows that reach beyond the pictures do not count
+    rows = slice(max(HALF_WINDOW - top, 0), height - HALF_WINDOW - top)
+    columns = slice(max(HALF_WINDOW - left, 0), width - HALF_WINDOW - left)
+    counted = picture.shape[2] * (height - 2 * HALF_WINDOW) * (width - 2 * HALF_WINDOW)
+    return 1 - float((1 - similarity[rows, columns]).sum()) / counted
 
 
 def albedo_scale(truth: Tensor, albedo: Tensor, mask: Tensor, channels: int = 3) -> Tensor:

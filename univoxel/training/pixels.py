@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -54,7 +54,7 @@ def split_pixels(
             were no object, wherever the photographs are looked at later. None: masks are right.
     """
     if doubted is not None:
-        photos = replace(photos, alpha=_without(photos.alpha, doubted))
+        photos = photos.without(doubted)
     counts = [int(_near(distance, doubted, view).sum()) for view in range(len(photos))]
     draw = torch.Generator().manual_seed(0)
     if sum(counts) > most:
@@ -96,14 +96,6 @@ def _near(distance: Tensor, doubted: Tensor | None, view: int) -> Tensor:
     """Which pixels [H, W] of a view are looked at."""
     near = distance[view] < MARGIN
     return near if doubted is None else near & ~doubted[view]
-
-
-def _without(alpha: Tensor, doubted: Tensor) -> Tensor:
-    """Alpha [V, H, W] that is 0 where it is doubted."""
-    result = memmap.zeros(alpha.shape, alpha.dtype)
-    for view in range(len(alpha)):
-        result[view] = alpha[view].masked_fill(doubted[view], 0)
-    return result
 
 
 # What a training will need, against what the machine leaves: said before the kernel says it.
