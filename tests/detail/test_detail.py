@@ -11,13 +11,14 @@ import torch
 import trimesh
 from analytic import cameras_around
 from asymmetric_scene import lopsided
+from PIL import Image
 from torch.nn.functional import normalize
 
 import univoxel
 from univoxel import Run, api, evaluate
 from univoxel.camera import image_rays
 from univoxel.cli import main
-from univoxel.cli.detail import made_after_training, minutes_left
+from univoxel.cli.detail import made_after_training, minutes_left, write
 from univoxel.cli.report import report
 from univoxel.color import linear_to_srgb
 from univoxel.core.records import Surface
@@ -31,6 +32,7 @@ from univoxel.output.mesh import bake
 from univoxel.output.page import PageOptions, model
 from univoxel.output.report_pictures import Split, compared
 from univoxel.output.surface import surface_of
+from univoxel.render.pictures import preview
 from univoxel.render.pipeline import shade, shade_hits, surface_of_view
 from univoxel.run import photos_of
 from univoxel.scene import load_checkpoint, save_scene
@@ -165,6 +167,21 @@ def test_pages_show_it(scene, tiny_copy, detail):
     mesh = trimesh.load(io.BytesIO(model(scene, options, None)), file_type="glb", force="mesh")
     picture = np.asarray(mesh.visual.material.baseColorTexture)[..., 0]
     assert picture.std() > 10  # of 255; the model's albedo is even
+
+
+def test_the_preview_shows_it(scene, photos, detail, tmp_path, monkeypatch):
+    monkeypatch.setattr(texture, "make_detail", lambda *_: detail)
+    save_scene(scene, tmp_path, {})
+    path, middle = tmp_path / "preview.png", slice(3 * SIZE // 8, 5 * SIZE // 8)
+
+    def spread() -> float:
+        albedo = np.asarray(Image.open(path))[middle, 2 * SIZE : 3 * SIZE, 0]
+        return float(albedo[:, middle].std())
+
+    preview(scene, photos, path)
+    even = spread()
+    assert write(scene, photos, tmp_path) == tmp_path / "detail"
+    assert spread() > 5 * even + 5  # of 255; the model's albedo is even
 
 
 def test_measures_and_reports_show_it(scene, photos, detail):

@@ -21,6 +21,7 @@ from torch.nn.functional import normalize
 
 from univoxel import brdf
 from univoxel.cli import trainer as train_task
+from univoxel.color import luminance
 from univoxel.config import JointConfig
 from univoxel.optim import RowAdam
 from univoxel.render.observations import MaterialLabels, Mirrors, prefiltered_roughness
@@ -448,6 +449,12 @@ def test_a_refit_leaves_materials_bit_for_bit(data, tmp_path, monkeypatch):
     assert not torch.equal(formed["sky.log_radiance"], before["sky.log_radiance"])
 
 
+def tint_(scene, tint: torch.Tensor) -> None:
+    """Give the mean of the map this colour [3]."""
+    mean = scene.sky.radiance.mean(0)
+    scene.sky.log_radiance.add_((tint * mean.mean() / mean).log())
+
+
 @pytest.mark.parametrize(
     ("metal", "evidence", "wanted", "share"),
     [
@@ -458,25 +465,33 @@ def test_a_refit_leaves_materials_bit_for_bit(data, tmp_path, monkeypatch):
     ],
 )
 def test_the_level_of_light_and_albedo(metal, evidence, wanted, share):
-    """What photographs show, the product of map and albedo, stays."""
+    """What photographs show, the product of map and albedo, stays; the map becomes white."""
     scene, problem = sphere_of((0.1, 0.1, 0.1), 0.5, 0.5)
     features = scene.field.features_at(problem.observations.position)
+    tint = torch.tensor([1.3, 1.0, 0.7])
     with torch.no_grad():
         scene.material.shift_albedo(features, torch.full((3,), 0.1))
-        before = scene.material(features)[0]
-        shown = scene.sky.radiance * before.median(0).values
+        tint_(scene, tint)
+        before = scene.material(features)[0] * tint**share
+        shown = scene.sky.radiance * scene.material(features)[0].median(0).values
         every = torch.full((len(features),), metal)
         joint_solve.set_level_(scene, problem, every, evidence)
         albedo = scene.material(features)[0]
     torch.testing.assert_close(scene.sky.radiance * albedo.median(0).values, shown)
-    expected = wanted**share * before.mean() ** (1 - share)
-    torch.testing.assert_close(albedo.mean(), expected, rtol=0.01, atol=0)
+    left = scene.sky.radiance.mean(0)
+    torch.testing.assert_close(
+        left / left.mean(), tint ** (1 - share) / (tint ** (1 - share)).mean()
+    )
+    level = before.mean(0).max() if metal else luminance(before).mean()
+    expected = before.mean(0) * (wanted / level) ** share
+    torch.testing.assert_close(albedo.mean(0), expected, rtol=0.01, atol=0)
 
 
 def test_bright_albedo_stays():
     scene, problem = sphere_of((0.1, 0.1, 0.1), 0.5, 0.5)
     features = scene.field.features_at(problem.observations.position)
     with torch.no_grad():
+        tint_(scene, torch.ones(3))
         before = scene.material(features)[0]
         joint_solve.set_level_(scene, problem, torch.zeros(len(features), dtype=torch.bool), 0.0)
         assert before.mean() > joint_solve.ORDINARY
@@ -489,6 +504,7 @@ def test_metal_parts_bound_the_level(monkeypatch):
     features = scene.field.features_at(problem.observations.position)
     with torch.no_grad():
         scene.material.shift_albedo(features, torch.full((3,), 0.1))
+        tint_(scene, torch.ones(3))
         monkeypatch.setattr(joint_solve, "ORDINARY_METAL", 0.15)
         joint_solve.set_level_(scene, problem, torch.arange(len(features)) < 99, 0.0)
         torch.testing.assert_close(

@@ -73,12 +73,14 @@ def write(scene: Scene, photos: Photos, run: Path, size: int | None = None) -> P
     import shutil
 
     from univoxel.detail.texture import FOLDER, make_detail, save_detail
+    from univoxel.render.pictures import preview
 
     shutil.rmtree(run / FOLDER, ignore_errors=True)
     detail = make_detail(scene, photos, size)
     if detail is None:
         return None
     save_detail(detail, run)
+    preview(scene, scene.registered(photos), run / "preview.png", albedo_near=detail.near)
     return run / FOLDER
 
 

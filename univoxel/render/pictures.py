@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, interpolate
 
 from univoxel.color import linear_to_srgb
+from univoxel.core.records import AlbedoNear
 from univoxel.data import Photos
 from univoxel.data.images import write_png
 from univoxel.envmap import EnvMap, lookup
@@ -178,10 +179,16 @@ def shrunk(photos: Photos, view: int, width: int, height: int) -> Tensor:
 # Pictures of a scene's present state.
 
 
-def preview(scene: Scene, photos: Photos, path: Path, view: int = 0) -> None:
-    """One photograph beside what the scene says of it: photo, render, albedo, roughness, normal."""
+def preview(
+    scene: Scene, photos: Photos, path: Path, view: int = 0, albedo_near: AlbedoNear | None = None
+) -> None:
+    """One photograph beside what the scene says of it: photo, render, albedo, roughness, normal.
+
+    Args:
+        albedo_near: what gives the albedo, in place of the field.
+    """
     width, height = photos.cameras.size(view)
-    surface, wo = surface_of_view(scene, photos.cameras, view)
+    surface, wo = surface_of_view(scene, photos.cameras, view, albedo_near)
     color, alpha = photos.picture(view)
     opacity = surface.opacity[:, None]
     tiles = [

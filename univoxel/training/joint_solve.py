@@ -209,31 +209,38 @@ def newton_phase_(
 
 @torch.no_grad()
 def set_level_(scene: Scene, problem: JointProblem, metal: Tensor, evidence: float) -> None:
-    """Make the map darker and the albedo brighter, towards an ordinary albedo.
+    """Make the map darker and whiter, and the albedo brighter, towards an ordinary albedo.
 
     What photographs show of diffuse surfaces and of metal is the product of the two. Only the
-    reflection of dielectrics, which no albedo changes, tells how bright the light is: little, if
-    they are rough, and every other reason why brightness changes with the view counts as such a
-    reflection. So the maps of rough objects come out several times too bright.
+    reflection of dielectrics, which no albedo changes, tells how bright and of what colour the
+    light is: little, if they are rough, and every other reason why brightness changes with the view
+    counts as such a reflection. So the maps of rough objects come out several times too bright. But
+    cameras balance the colours of photographs so that the light looks white.
 
     Args:
         metal: [N] bool, of the points.
         evidence: `NewtonRound.level`.
     """
-    features = scene.field.features_at(problem.observations.position)
+    features, share = scene.field.features_at(problem.observations.position), 1.0
+    if not metal.all():
+        share = LEVEL / (LEVEL + evidence)
     albedo = scene.material(features)[0]
+    median = albedo.median(0).values
+    light = problem.sky.radiance.mean(0)
+    factor = torch.ones(3) if scene.flash else (light / light.mean()) ** share
+    albedo = factor * albedo
     if metal.all():
-        factor = ORDINARY_METAL / albedo.mean(0).max()
+        level = ORDINARY_METAL / albedo.mean(0).max()
     else:
-        above = (ORDINARY / luminance(albedo[~metal]).mean()).clamp_min(1.0)
-        factor = above ** (LEVEL / (LEVEL + evidence))
+        level = (ORDINARY / luminance(albedo[~metal]).mean()).clamp_min(1.0) ** share
         if metal.float().mean() > FEW_METALS:  # their reflectance rises with the albedo of the rest
             most = ORDINARY_METAL / albedo[metal].amax(1).mean()
-            factor = torch.minimum(factor, most.clamp_min(1.0))
-    scene.material.shift_albedo(features, factor * albedo.median(0).values)
+            level = torch.minimum(level, most.clamp_min(1.0))
+    factor = level * factor
+    scene.material.shift_albedo(features, factor * median)
     problem.sky.log_radiance.sub_(factor.log())
     if scene.flash is not None:
-        scene.flash.log_radiance.sub_(factor.log())
+        scene.flash.log_radiance.sub_(level.log())
 
 
 def with_metals(
