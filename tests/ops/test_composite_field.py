@@ -97,16 +97,6 @@ def test_native_equals_reference(kind, hashed, min_share):
     check_op(*calls, [tuple(leaves)])
 
 
-@pytest.mark.parametrize("needs", [(True, False, False, False), (False, True, False, False)])
-@pytest.mark.parametrize("hashed", [False, True])
-def test_some_gradients_alone(hashed, needs):
-    leaves, samples, options = case("dense", hashed, needs=needs)
-    calls = [
-        function(op, samples, options, 0.0) for op in (composite_field, composite_field_reference)
-    ]
-    check_op(*calls, [tuple(leaves)])
-
-
 @pytest.mark.parametrize("hashed", [False, True])
 def test_it_is_the_chain_of_the_ops(hashed):
     """march, sample, encode, section_alpha and composite, each the native one."""
