@@ -96,15 +96,8 @@ def shrink(panel: Panel) -> Panel:
     """The panel at about the size it is drawn in, so that sheets of large views fit in memory."""
     every = max(1, min(panel.estimate.shape[:2]) // (2 * TILE))
 
-    def small(x: Tensor | None) -> Tensor | None:
-        return None if x is None else x[::every, ::every].clone()
-
-    return replace(
-        panel,
-        estimate=panel.estimate[::every, ::every].clone(),
-        truth=small(panel.truth),
-        error=small(panel.error),
-    )
+    tensors = {name: x for name, x in vars(panel).items() if isinstance(x, Tensor)}
+    return replace(panel, **{name: x[::every, ::every].clone() for name, x in tensors.items()})
 
 
 def _tile_size(picture: Tensor) -> tuple[int, int]:
