@@ -101,15 +101,7 @@ Backward: TypeAlias = (
 )
 
 
-def differentiable(
-    to: str,
-    *,
-    name: str | None = None,
-    forward: Forward | None = None,
-    backward: Backward | None = None,
-    held: int = 0,
-    optional: str = "",
-) -> Callable[[Callable], Differentiable]:
+def differentiable(to: str, **settings: Any) -> Callable[[Callable], Differentiable]:
     """Make an op with gradients of a function that allocates its outputs.
 
         @differentiable(to="alpha value")
@@ -142,15 +134,7 @@ def differentiable(
         optional: those of `to` whose gradient is an empty array where it is not needed. The kernel
             computes the others always.
     """
-    return lambda allocate: Differentiable(
-        name or allocate.__name__.removeprefix("_"),
-        allocate,
-        to.split(),
-        forward,
-        backward,
-        held,
-        optional.split(),
-    )
+    return lambda allocate: Differentiable(allocate, to.split(), **settings)
 
 
 class Differentiable(native.Operator):
@@ -158,14 +142,15 @@ class Differentiable(native.Operator):
 
     def __init__(
         self,
-        name: str,
         allocate: Callable,
         to: list[str],
-        forward: Forward | None,
-        backward: Backward | None,
-        held: int,
-        optional: list[str],
+        name: str | None = None,
+        forward: Forward | None = None,
+        backward: Backward | None = None,
+        held: int = 0,
+        optional: str = "",
     ) -> None:
+        name = name or allocate.__name__.removeprefix("_")
         hints = native.hints_of(allocate)
         arguments = {n: h for n, h in hints.items() if n != "return"}
         tensors = {n: h for n, h in arguments.items() if h is Tensor}
@@ -176,7 +161,8 @@ class Differentiable(native.Operator):
         self._count, self._tensors = len(arguments), len(tensors)
         self._held, self._shown = held, len(outputs) - held
         self._sparse = [*options].index("sparse_grad") if "sparse_grad" in options else None
-        self._find = backward or _backward_by_name(name, self._to, [n in optional for n in to])
+        spared = [n in optional.split() for n in to]
+        self._find = backward or _backward_by_name(name, self._to, spared)
         fill = forward or _forward_by_name(name)
         n, several = len(tensors), len(outputs) > 1
 
