@@ -14,6 +14,7 @@ All on one thread, by its processor time: other programs then slow what is compa
 
 from __future__ import annotations
 
+import math
 import time
 
 import numpy as np
@@ -24,9 +25,36 @@ from torch import Tensor
 
 from univoxel import brdf
 from univoxel import envmap as env
-from univoxel.ops import relight
+from univoxel.ops import EnvTables, relight
 
 OFFSET = 1e-3
+
+
+def sample(tables: EnvTables, uniform: Tensor) -> tuple[Tensor, Tensor]:
+    """Draw directions [N, 3] and give their density [N] per steradian.
+
+    Args:
+        uniform: [N, 2] in [0, 1): across and down the map.
+
+    Source: Pharr, Jakob and Humphreys 2023, section A.5.
+    """
+    row, down = _invert(tables.row_cdf.expand(len(uniform), -1), uniform[:, 1])
+    column, across = _invert(tables.column_cdf[row], uniform[:, 0])
+    height, width, _ = tables.radiance.shape
+    top, bottom = (torch.cos(math.pi * (row + i) / height) for i in (0, 1))
+    z = top + down * (bottom - top)
+    phi = math.pi - 2 * math.pi * (column + across) / width + tables.rotation
+    radius = (1 - z * z).clamp_min(0).sqrt()
+    direction = torch.stack([radius * phi.cos(), radius * phi.sin(), z], -1)
+    return direction, tables.texel[row, column, 3]
+
+
+def _invert(cdf: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """The interval of each row of cdf [N, n + 1] that holds u [N], and the place within it."""
+    i = torch.searchsorted(cdf.contiguous(), u[:, None].contiguous(), right=True) - 1
+    i = i.clamp(0, cdf.shape[1] - 2)
+    low, high = cdf.gather(1, i)[:, 0], cdf.gather(1, i + 1)[:, 0]
+    return i[:, 0], ((u - low) / (high - low).clamp_min(1e-30)).clamp_max(1 - 2**-24)
 
 
 def ray_rates(scene: Scene, samples: int = 64, repeat: int = 9) -> dict:
@@ -34,7 +62,8 @@ def ray_rates(scene: Scene, samples: int = 64, repeat: int = 9) -> dict:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     visibility, _, light, position, normal, wo, albedo, roughness = scene.ours
-    direction = env.sample(light, _sobol(len(position), samples))[0].view(-1, samples, 3)
+    direction, density = sample(light, _sobol(len(position), samples))
+    direction = direction.view(-1, samples, 3)
     radiance = env.background(light, direction.reshape(-1, 3)).view_as(direction)
     above = ((direction * normal[:, None]).sum(-1) > 0) & (radiance.sum(-1) > 0)
     start = (position + OFFSET * normal)[:, None].expand_as(direction)[above]
@@ -46,7 +75,7 @@ def ray_rates(scene: Scene, samples: int = 64, repeat: int = 9) -> dict:
 
     seen = torch.zeros(above.shape)
     seen[above] = 1 - visibility.occluded(*rays, 0.0).float()
-    density = env.pdf(light, direction.reshape(-1, 3)).view_as(seen)
+    density = density.view_as(seen)
     f = torch.stack(
         [
             brdf.evaluate(n, o, wi, a, r.expand(samples))

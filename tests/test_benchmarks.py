@@ -9,23 +9,25 @@ from pathlib import Path
 import pytest
 
 
-def test_a_dying_contender_leaves_the_run_alone(monkeypatch):
+@pytest.fixture(autouse=True)
+def importable(monkeypatch):
     monkeypatch.syspath_prepend(Path(__file__).parent.parent / "benchmarks")
+
+
+def test_a_dying_contender_leaves_the_run_alone():
     workers = pytest.importorskip("workers")
     with pytest.raises(RuntimeError, match="ended with -6"):
         workers.Worker(os.abort)
 
 
-def test_what_a_profile_times_is_there(monkeypatch):
-    monkeypatch.syspath_prepend(Path(__file__).parent.parent / "benchmarks")
+def test_what_a_profile_times_is_there():
     profile_run = pytest.importorskip("profile_run")
     for part, places in profile_run.PARTS.items():
         for owner, name in places:
             assert callable(getattr(owner, name, None)), f"{part}: {owner} has no {name}"
 
 
-def test_parts_that_run_once_include_what_they_call(monkeypatch):
-    monkeypatch.syspath_prepend(Path(__file__).parent.parent / "benchmarks")
+def test_parts_that_run_once_include_what_they_call():
     profile_run = pytest.importorskip("profile_run")
     clock = profile_run.RunClock(None, lambda: 0.0)
     part = clock.timed("light", lambda: None)
@@ -36,7 +38,6 @@ def test_parts_that_run_once_include_what_they_call(monkeypatch):
 
 
 def test_rays_without_bare_embree_are_refused(monkeypatch, tmp_path, capsys):
-    monkeypatch.syspath_prepend(Path(__file__).parent.parent / "benchmarks")
     monkeypatch.setattr("sys.argv", ["relight.py", str(tmp_path / "out.json"), "--only", "rays"])
     benchmark = pytest.importorskip("relight", exc_type=ImportError)
     monkeypatch.setattr(benchmark, "BARE_EMBREE", tmp_path / "none.so")
@@ -46,8 +47,7 @@ def test_rays_without_bare_embree_are_refused(monkeypatch, tmp_path, capsys):
 
 
 @pytest.fixture
-def figures(monkeypatch):
-    monkeypatch.syspath_prepend(Path(__file__).parent.parent / "benchmarks")
+def figures():
     return pytest.importorskip("figures")
 
 

@@ -87,24 +87,9 @@ def calls(monkeypatch):
 def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
     out = tmp_path / "run"
     changes = ["loss.radiance=2", "seed=7", "stages.1.voxels=3", "stages.0.lr_sdf=(0.5, 0.1)"]
-    options = [
-        "--preset",
-        "draft",
-        "--light",
-        "sg",
-        "--varying",
-        "exposure",
-        "--minutes",
-        "2",
-        "--downscale",
-        "4",
-        "--masks",
-        "given",
-        "--cameras",
-        "refined",
-        "--allow-outside",
-        *(f"--set={change}" for change in changes),
-    ]
+    text = "--preset draft --light sg --varying exposure --minutes 2 --downscale 4 --masks given"
+    options = f"{text} --cameras refined --allow-outside".split()
+    options += [f"--set={change}" for change in changes]
     assert main(["train", "photos", "--out", str(out), *options]) == 0
     expected = chosen("draft", 2.0, Path("photos"), out, "sg", "exposure")
     first, second, *others = expected.stages

@@ -110,12 +110,6 @@ def test_little_time_goes_into_neither_colours_nor_patches():
 
 
 @pytest.mark.parametrize("light", ["hybrid", "sg"])
-def test_presets_carve_where_it_takes_a_small_share_of_their_time(light):
-    seconds = preset("fast", Path("a"), Path("b"), light).carving_seconds
-    assert seconds == pytest.approx(0.1 * 60 * PRESETS["fast"].minutes)
-
-
-@pytest.mark.parametrize("light", ["hybrid", "sg"])
 def test_exposures_are_looked_at_unless_it_is_said_what_differs(light):
     found = {
         varying: preset("fast", Path("a"), Path("b"), light, varying)

@@ -315,6 +315,4 @@ def _centred(values: Tensor) -> Tensor:
 
 def _cross(vector: Tensor) -> Tensor:
     """Matrices [V, 3, 3] that multiply by vectors [V, 3] as the cross product does."""
-    x, y, z = vector.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
+    return torch.linalg.cross(vector[:, None], torch.eye(3).to(vector)[None]).mT

@@ -213,7 +213,8 @@ class TrainConfig:
     def __post_init__(self) -> None:
         check_settings(self)
         check_fields(self, "a path", lambda x: isinstance(x, Path), "data", "out")
-        check_fields(self, "a path in UTF-8", _is_utf8, "data", "out")
+        # Other names can be made, but not every library opens such files
+        check_fields(self, "a path in UTF-8", lambda x: bool(str(x).encode()), "data", "out")
         first = "a tuple whose first stage is a StageConfig, which creates the grid"
         check_fields(self, first, lambda x: x and isinstance(x[0], StageConfig), "stages")
         kinds = [s.field for s in self.stages if isinstance(s, StageConfig)]
@@ -244,14 +245,6 @@ class TrainConfig:
             raise ConfigError(
                 f"TrainConfig: budget_mb={self.budget_mb:g} needs capacity=adaptive, got fixed"
             )
-
-
-def _is_utf8(path: Path) -> bool:
-    """Whether files can hold the name: others can be made, but not every library opens them."""
-    try:
-        return bool(str(path).encode())
-    except UnicodeEncodeError:
-        return False
 
 
 def save_config(cfg: TrainConfig) -> None:

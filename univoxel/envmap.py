@@ -80,7 +80,7 @@ def lookup(envmap: EnvMap, direction: Tensor) -> Tensor:
 
 
 def tables(envmap: EnvMap) -> EnvTables:
-    """Tables that draw texels in proportion to their light, for `sample`, `pdf` and `relight`.
+    """Tables that draw texels in proportion to their light, for `relight`.
 
     A texel's share is its solid angle times the luminance of the interpolated map, averaged over
     the texel: wherever a lookup finds light, the share is above 0. A black map is drawn uniformly.
@@ -114,47 +114,10 @@ def background(tables: EnvTables, direction: Tensor) -> Tensor:
     return lookup(EnvMap(tables.radiance, math.degrees(tables.rotation)), direction)
 
 
-def sample(tables: EnvTables, uniform: Tensor) -> tuple[Tensor, Tensor]:
-    """Draw directions [N, 3] and give their density [N] per steradian.
-
-    Args:
-        uniform: [N, 2] in [0, 1): across and down the map.
-
-    Source: Pharr, Jakob and Humphreys 2023, section A.5.
-    """
-    row, down = _invert(tables.row_cdf.expand(len(uniform), -1), uniform[:, 1])
-    column, across = _invert(tables.column_cdf[row], uniform[:, 0])
-    height, width, _ = tables.radiance.shape
-    top, bottom = (torch.cos(math.pi * (row + i) / height) for i in (0, 1))
-    z = top + down * (bottom - top)
-    phi = math.pi - 2 * math.pi * (column + across) / width + tables.rotation
-    radius = (1 - z * z).clamp_min(0).sqrt()
-    direction = torch.stack([radius * phi.cos(), radius * phi.sin(), z], -1)
-    return direction, tables.texel[row, column, 3]
-
-
-def pdf(tables: EnvTables, direction: Tensor) -> Tensor:
-    """Density [N] per steradian with which `sample` draws unit directions [N, 3]."""
-    height, width, _ = tables.radiance.shape
-    turn = direction.new_tensor(-tables.rotation)
-    u, v = direction_to_latlong(rotate_z(direction, turn)).unbind(-1)
-    row = (v * height).long().clamp_max(height - 1)
-    column = (u * width).long().clamp_max(width - 1)
-    return tables.texel[row, column, 3]
-
-
 def _cdf(share: Tensor) -> Tensor:
     """Normalised running sums along the last axis, from 0 to exactly 1: [..., n + 1] float32."""
     total = torch.nn.functional.pad(share.cumsum(-1), (1, 0))
     return (total / total[..., -1:]).float().contiguous()
-
-
-def _invert(cdf: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-    """The interval of each row of cdf [N, n + 1] that holds u [N], and the place within it."""
-    i = torch.searchsorted(cdf.contiguous(), u[:, None].contiguous(), right=True) - 1
-    i = i.clamp(0, cdf.shape[1] - 2)
-    low, high = cdf.gather(1, i)[:, 0], cdf.gather(1, i + 1)[:, 0]
-    return i[:, 0], ((u - low) / (high - low).clamp_min(1e-30)).clamp_max(1 - 2**-24)
 
 
 # Environment maps from files.

@@ -9,8 +9,6 @@ from rich.progress import BarColumn, TextColumn
 
 from univoxel.core import progress_bar
 
-LOGGER = logging.getLogger("univoxel")
-
 
 @pytest.fixture
 def clock(monkeypatch):

@@ -2,7 +2,6 @@
 
 import errno
 import os
-import stat
 import struct
 import zlib
 from concurrent.futures import ThreadPoolExecutor
@@ -167,14 +166,6 @@ def test_other_kinds_under_the_name_of_jpeg(tmp_path):
     (tmp_path / "a.tif").write_bytes(b"II*\0" + bytes(40))
     with pytest.raises(DataError, match=r"this TIFF could not be read: .*: convert it to"):
         images.read_image(tmp_path / "a.tif")
-
-
-def test_jpeg(tmp_path):
-    Image.new("RGB", (8, 4), (200, 100, 50)).save(tmp_path / "a.JPG", quality=100)
-    image = images.read_image(tmp_path / "a.JPG")
-    assert image.shape == (4, 8, 3)
-    # JPEG rounds its colour transform
-    torch.testing.assert_close(image[0, 0].float(), torch.tensor([200.0, 100, 50]), atol=2, rtol=0)
 
 
 # OpenEXR
@@ -484,15 +475,6 @@ def test_empty_missing_and_foreign_files(tmp_path, suffix):
         images.read_image(path)
 
 
-def test_png_that_declares_a_huge_size(tmp_path):
-    images.write_png(tmp_path / "a.png", np.zeros((4, 4), np.uint8))
-    content = bytearray((tmp_path / "a.png").read_bytes())
-    content[16:24] = struct.pack(">II", 1 << 30, 1 << 30)
-    (tmp_path / "a.png").write_bytes(content)
-    with pytest.raises(DataError, match=r"a\.png: expected a PNG or JPEG"):
-        images.read_image(tmp_path / "a.png")
-
-
 def test_unknown_suffix(tmp_path):
     with pytest.raises(DataError, match=r"expected an image \(\.png .* got '\.bmp'"):
         images.read_image(tmp_path / "a.bmp")
@@ -541,15 +523,6 @@ def write(path, value):
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.exr"])
-def test_new_files_get_usual_permissions(tmp_path, name):
-    (tmp_path / "plain").write_bytes(b"")
-    write(tmp_path / name, 1)
-    assert stat.S_IMODE((tmp_path / name).stat().st_mode) == stat.S_IMODE(
-        (tmp_path / "plain").stat().st_mode
-    )
-
-
-@pytest.mark.parametrize("name", ["a.png", "a.exr"])
 def test_a_missing_folder_is_named(tmp_path, name):
     with pytest.raises(OSError, match=rf"cannot write: No such file or directory: .*none/{name}"):
         write(tmp_path / "none" / name, 1)
@@ -565,21 +538,12 @@ def test_a_full_disk_leaves_the_old_file(tmp_path, name):
     with replacing(path) as temporary:  # learn its name
         temporary.write_bytes(path.read_bytes())
     temporary.symlink_to("/dev/full")
-    with pytest.raises(OSError, match=rf"cannot write: .*No space left on device.*{name}"):
+    message = rf"cannot write: .*No space left on device.*{name}"
+    with pytest.raises(OSError, match=message) as caught:
         write(path, 2)
+    assert caught.value.errno == errno.ENOSPC
     assert float(images.read_image(path)[0, 0, 0]) == 1
     assert [path.name for path in tmp_path.iterdir()] == [name]
-
-
-def test_a_failed_replacement_cleans_up(tmp_path, monkeypatch):
-    def replace(source, target):
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS), source)
-
-    monkeypatch.setattr(os, "replace", replace)
-    with pytest.raises(OSError, match=r"Read-only file system: .*a\.png") as caught:
-        write(tmp_path / "a.png", 1)
-    assert caught.value.errno == errno.EROFS
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.exr"])

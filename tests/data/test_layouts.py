@@ -202,24 +202,3 @@ def test_masks_may_be_alpha_too(tmp_path):
     photos = load_photos(tmp_path)
     views = written.split("train")
     assert np.array_equal(photos.alpha.numpy(), written.pictures[views, ..., 3])
-
-
-@pytest.mark.parametrize("name", ["{}.png", "{}.jpg", "{}.JPG"])
-def test_masks_by_the_name_of_the_photograph(tmp_path, name):
-    """Painted over copies of the photographs, whatever their format."""
-    from PIL import Image
-
-    write_colmap(tmp_path, scene())
-    for v, stem in enumerate(scene().names):
-        (tmp_path / "masks" / f"{stem}.png.png").unlink()
-        mask = np.full((HEIGHT, WIDTH, 3), 20 * v, np.uint8)
-        Image.fromarray(mask).save(tmp_path / "masks" / name.format(stem))
-    assert load_photos(tmp_path).alpha[:, 0, 0].tolist() == [20 * v for v in scene().split("train")]
-
-
-def test_photographs_without_masks_say_how_to_make_some(tmp_path):
-    write_colmap(tmp_path, scene())
-    for mask in (tmp_path / "masks").iterdir():
-        mask.unlink()
-    with pytest.raises(DataError, match=r"p_001\.png: expected an alpha channel or a mask .*cut"):
-        load_photos(tmp_path)

@@ -54,10 +54,6 @@ def two_lights(folder):
         (meta(cam_angle_x=40), "expected cam_angle_x between 0 and 3.142, got 40"),
         (meta(imw=13), r"metadata\.json: expected images of 13x8 pixels .*, got 12x8"),
         (
-            lambda f: (f / "train_001" / "metadata.json").write_text("{"),
-            "metadata.json: invalid JSON",
-        ),
-        (
             lambda f: [(f / f"train_00{v}" / "rgba_sunset.png").unlink() for v in range(5)],
             r"missing images: .*train_000/rgba_sunset\.png, .* \(5 of 8\)",
         ),

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from analytic import RADIUS, photos_of, scene_of
+from analytic import photos_of, scene_of
 from observed_points import RED, lamps, photographs_under
 
 from univoxel.evaluation import confidence
@@ -184,7 +184,3 @@ def test_words_leave_out_what_is_not_the_case(surveyed):
     assert "A bright albedo and a bright light look the same" in said
     assert "trouble" not in said
     assert "recovered: 2. The last one: stage 1: b." in words(figures, ["a", "stage 1: b"])
-
-
-def test_points_lie_on_the_sphere(surveyed):
-    assert (surveyed.position.norm(dim=1) - RADIUS).abs().max() < 0.02

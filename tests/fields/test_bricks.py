@@ -6,11 +6,10 @@ import pytest
 import torch
 from analytic import cameras_around
 from asymmetric_scene import lopsided
-from asymmetric_scene import sdf as lopsided_sdf
 from scipy.spatial import KDTree
 
 from univoxel.fields import bricks as bricks_module
-from univoxel.fields.bricks import BAND, pack_bricks, unpack_bricks
+from univoxel.fields.bricks import BAND
 from univoxel.fields.field import dense_field
 from univoxel.fields.grid import GridShape, fit_grid
 from univoxel.ops import brick_minimum
@@ -226,28 +225,6 @@ def test_the_optimiser_goes_on_when_bricks_come():
     still = torch.ones(len(moments), dtype=torch.bool)
     still[touched[touched < len(moments)]] = False
     assert torch.equal(state["exp_avg"][: len(moments)][still], moments[still])
-
-
-def test_bricks_pack_and_unpack():
-    field = sphere(41).in_bricks(sphere(41).grid)
-    parts = pack_bricks(field.distances)
-    bricks = unpack_bricks(parts["place"], parts["inside"], field.grid.size)
-    assert torch.equal(bricks.table, field.distances.bricks.table)
-    assert len(bricks.place) == field.distances.count
-    with pytest.raises((ValueError, IndexError)):
-        unpack_bricks(parts["place"], parts["inside"], (8, 8, 8))
-
-
-def test_rays_meet_the_same_surface_through_a_moved_scene():
-    """March and sample agree with the dense field on an object that is no sphere."""
-    scene = lopsided(48**3)
-    dense = scene.field
-    assert dense.kind == "dense"
-    sparse = dense.in_bricks(dense.grid)
-    a, b = images(scene, sparse), images(scene, dense)
-    assert psnr(a, b) > 55
-    nodes = dense.grid.nodes()
-    torch.testing.assert_close(dense.sdf.detach(), lopsided_sdf(nodes))
 
 
 @pytest.mark.parametrize("kind", ["dense", "sparse"])

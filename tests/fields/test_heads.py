@@ -58,32 +58,6 @@ def test_materials_see_their_channels_only():
     assert not features.grad[:, 4:].any()
 
 
-def test_radiance_is_a_colour_that_depends_on_the_view():
-    head, n = RadianceHead(6, 16), 50
-    features, normal, wo = torch.randn(n, 6), directions(n), directions(n)
-    color = head(features, normal, wo)
-    assert color.shape == (n, 3)
-    assert ((color > 0) & (color < 1)).all()
-    assert (head(features, normal, directions(n)) - color).abs().max() > 1e-3
-
-
-def test_radiance_mirrors_the_view_about_the_normal():
-    """Seen from wo and from its mirror image at the same point only the mirrored direction
-    differs; along the normal both coincide."""
-    head, features, normal = RadianceHead(2, 8), torch.randn(1, 2), directions(1)
-    torch.testing.assert_close(
-        head(features, normal, normal),
-        torch.sigmoid(
-            head.net(
-                torch.cat(
-                    [features, normal, normal, (2 * normal).sin(), (2 * normal).cos(),
-                     torch.ones(1, 1)], 1,
-                )
-            )
-        ),
-    )  # fmt: skip
-
-
 def test_radiance_reads_its_table_in_the_mirrored_direction():
     head, n = RadianceHead(2, 8, levels=3), 40
     features, normal, wo = torch.randn(n, 2), directions(n), directions(n)

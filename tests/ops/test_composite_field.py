@@ -39,7 +39,7 @@ def place(rays=6, seed=0):
     return sdf, origin, direction, Samples(t, connected, offsets), g
 
 
-def case(kind, hashed=False, channels=3, needs=(True, True, True, True), **more):
+def case(kind, hashed=False, channels=3, **more):
     """Leaves, and a function of them that is an op or its reference."""
     sdf, origin, direction, samples, g = place(**more)
     options = {"levels": LEVELS} if hashed else {}
@@ -50,8 +50,7 @@ def case(kind, hashed=False, channels=3, needs=(True, True, True, True), **more)
     features = torch.randn(shape, generator=g, dtype=torch.float64)
     if kind == "bricks" and not hashed:
         features[:128] = 0
-    leaves = sdf.clone(), features, origin, direction
-    leaves = [x.requires_grad_(need) for x, need in zip(leaves, needs, strict=True)]
+    leaves = [x.requires_grad_() for x in (sdf.clone(), features, origin, direction)]
     return leaves, samples, options
 
 
@@ -93,16 +92,6 @@ def test_native_equals_reference(kind, hashed, min_share):
     calls = [
         function(op, samples, options, min_share, fixed)
         for op in (composite_field, composite_field_reference)
-    ]
-    check_op(*calls, [tuple(leaves)])
-
-
-@pytest.mark.parametrize("needs", [(True, False, False, False), (False, True, False, False)])
-@pytest.mark.parametrize("hashed", [False, True])
-def test_some_gradients_alone(hashed, needs):
-    leaves, samples, options = case("dense", hashed, needs=needs)
-    calls = [
-        function(op, samples, options, 0.0) for op in (composite_field, composite_field_reference)
     ]
     check_op(*calls, [tuple(leaves)])
 

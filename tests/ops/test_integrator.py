@@ -100,26 +100,6 @@ def test_direct_light_equals_quadrature(strategy, blocked):
     assert (got - wanted).norm() / wanted.norm() < (0.003 if strategy == "mis" else 0.01)
 
 
-def test_error_falls_with_samples():
-    mesh, scene = octahedron()
-    normal, wo = sphere_points(200, seed=7)
-    truth = shade(mesh, scene, spotted_map(), normal, wo, 0.5, samples=16384, seed=9)
-    error = [
-        (shade(mesh, scene, spotted_map(), normal, wo, 0.5, samples=n) - truth).norm().item()
-        for n in (16, 256)
-    ]
-    assert error[1] < error[0] / 4  # sixteen times the samples, 1 / sqrt(16) or better
-
-
-def test_another_seed_draws_other_directions():
-    mesh, scene = octahedron(albedo=0.6)
-    points = sphere_points(300)
-    one, other = (
-        shade(mesh, scene, spotted_map(), *points, 0.5, samples=8, seed=s) for s in (0, 1)
-    )
-    assert not torch.equal(one, other)
-
-
 def test_points_off_the_surface_do_not_shade_themselves():
     """A start just inside the mesh sees the sky once the offset carries it out."""
     mesh, scene = octahedron()

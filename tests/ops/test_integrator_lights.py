@@ -103,20 +103,6 @@ def test_bounced_sunlight_has_its_closed_form():
     torch.testing.assert_close(bounced[0], wanted, rtol=5e-3, atol=0)  # noise of 65536 paths
 
 
-def test_coloured_f0_in_the_furnace():
-    """A metal in white light shows E of its F0, channel by channel."""
-    mesh, scene = octahedron()
-    normal, wo = sphere_points(100)
-    f0 = torch.tensor([1.0, 0.7, 0.3])
-    rgb = shade(mesh, scene, WHITE, normal, wo, 0.0, torch.tensor(0.4), samples=1024,
-                f0=f0.expand(100, 3))  # fmt: skip
-    cosine = (normal * wo).sum(1)
-    layer = torch.stack(
-        [brdf.specular_albedo(cosine, torch.tensor(0.4), f0=float(x)) for x in f0], 1
-    )
-    torch.testing.assert_close(rgb.mean(0), layer.mean(0), rtol=0, atol=5e-3)  # the fit's error
-
-
 def test_calls_that_go_on_make_one_sequence():
     mesh, scene = octahedron()
     normal, wo = sphere_points(20)

@@ -144,21 +144,3 @@ def test_fixed_light_gets_no_gradient():
     needs = [False, False, True, True, False]
     grads = _shade_radiance.backward(*tensors, torch.tensor(f0), torch.ones(3, 3), omega, needs)
     assert [g.numel() for g in grads] == [0, 0, 9, 3, 0]
-
-
-def test_the_two_forms_agree():
-    map, visibility, indirect, index, *rest = mapped(6, 40)
-    radiance = visibility[index][..., None] / 255 * map + indirect[index]
-    torch.testing.assert_close(
-        shade_map(map, visibility, indirect, index, *rest), shade_radiance(radiance, *rest)
-    )
-
-
-def test_light_below_the_horizon_counts_for_nothing():
-    radiance, normal, *rest = lit(3, 64)
-    below = (normal @ rest[3].T <= 0)[..., None]
-    rgb = shade_radiance(radiance, normal, *rest)
-    (grad,) = torch.autograd.grad(rgb.sum(), radiance)
-    assert int(below.sum()) > 50
-    assert bool((grad == 0).eq(below).all())
-    assert torch.equal(shade_radiance(radiance.masked_fill(below, 9.0), normal, *rest), rgb)

@@ -69,15 +69,6 @@ def test_points_follow_the_area():
     assert torch.allclose(normal[first], normalize(weight @ normals[:3], dim=1), atol=1e-5)
 
 
-def test_points_of_a_sphere_are_even_and_on_it(sphere):
-    point, normal = surface_points(sphere, 4000, generator())
-    assert (point.norm(dim=1) - RADIUS).abs().max() < 0.002  # chords of a grid of 0.05
-    assert ((normal * normalize(point, dim=1)).sum(1)).min() > 0.99
-    octant = ((point > 0) * torch.tensor([1, 2, 4])).sum(1)
-    # The marching cubes list faces by x, which is even by strata; y and z stray as coins do
-    assert (torch.bincount(octant, minlength=8) - 500).abs().max() < 4 * math.sqrt(500)
-
-
 def test_observations_of_a_sphere(sphere, photos):
     position, normal = surface_points(sphere, 600, generator())
     tracer = VisibilityScene(sphere.vertices, sphere.faces)

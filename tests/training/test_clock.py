@@ -8,7 +8,6 @@ import pytest
 from plain import plain_stage, plain_training
 
 from univoxel.config import PREPARATION
-from univoxel.core.files import append_line
 from univoxel.training import clock as clock_module
 from univoxel.training.clock import HURRY, LEAST, RESERVE_SECONDS, REST, expected_seconds
 from univoxel.training.progress import Progress
@@ -370,12 +369,3 @@ def test_a_run_that_several_processes_began_goes_on(tmp_path, clock):
     progress = Progress(config(tmp_path, 0.5, 0.5), clock.now, before)
     assert (progress.clock.stage, progress.clock.step) == (1, 7)
     assert "ranks" not in progress.state()
-
-
-def test_a_line_is_appended_whole_or_not_at_all(tmp_path):
-    path = tmp_path / "log.jsonl"
-    append_line(path, "one")
-    append_line(path, "two")
-    assert path.read_text() == "one\ntwo\n"
-    with pytest.raises(OSError, match=r"cannot write: No such file.*missing"):
-        append_line(tmp_path / "missing" / "log.jsonl", "three")

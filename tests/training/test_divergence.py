@@ -128,26 +128,6 @@ def test_a_collapse_goes_back(data, tmp_path, monkeypatch):
     assert lines[-1]["troubles"] == [told]
 
 
-def test_one_failure_in_the_joint_stage(monkeypatch):
-    scene, steps = sphere_scene(32), Steps(40)
-    failing(monkeypatch, joint_solve, "objective", bad_joint, lambda i: i == 5)
-    joint_solve.solve(scene, photos_of(8, 16), JOINT, 0, steps)
-    assert finite(scene)
-    assert len(steps.troubles) == 1
-    assert "step 5: the loss is nan; dropped this step" in steps.troubles[0]
-    assert steps.step == 39
-
-
-def test_repeated_failure_in_the_joint_stage(monkeypatch):
-    scene, steps = sphere_scene(32), Steps(40)
-    failing(monkeypatch, joint_solve, "objective", bad_joint, lambda i: i >= 5)
-    joint_solve.solve(scene, photos_of(8, 16), JOINT, 0, steps)
-    assert finite(scene)
-    assert len(steps.troubles) == LIMIT + 1
-    assert steps.abandoned
-    assert steps.step == 5 + LIMIT
-
-
 JOINT = JointConfig(
     iterations=40, rounds=2, points=200, newton_points=100, newton_steps=1, rays=64, tracing=1
 )
@@ -157,24 +137,34 @@ def bad_joint(terms, scene):
     return terms | {"bad": terms["joint"] * float("nan")}
 
 
-def test_a_surface_that_is_gone_leaves_light_and_materials():
-    scene, steps = sphere_scene(8), Steps(10)
-    steps.skip = lambda: steps.asked.append("skip")
-    scene.field.sdf.data.fill_(1.0)
-    before = {k: v.clone() for k, v in scene.state_dict().items()}
-    joint_solve.solve(scene, photos_of(2, 8), JOINT, 0, steps)
-    assert steps.asked == ["skip"]
-    assert "the field has no surface" in steps.troubles[0]
-    assert all(torch.equal(before[k], v) for k, v in scene.state_dict().items())
+@pytest.mark.parametrize(
+    ("bad", "troubles", "last"), [({5}, 1, 39), (range(5, 40), LIMIT + 1, 5 + LIMIT)]
+)
+def test_failures_in_the_joint_stage(monkeypatch, bad, troubles, last):
+    scene, steps = sphere_scene(32), Steps(40)
+    failing(monkeypatch, joint_solve, "objective", bad_joint, lambda i: i in bad)
+    joint_solve.solve(scene, photos_of(8, 16), JOINT, 0, steps)
+    assert finite(scene)
+    assert len(steps.troubles) == troubles
+    assert "step 5: the loss is nan; dropped this step" in steps.troubles[0]
+    assert steps.abandoned == (troubles > LIMIT)
+    assert steps.step == last
 
 
-def test_a_surface_that_no_photograph_sees_leaves_light_and_materials():
+@pytest.mark.parametrize("gone", [True, False])
+def test_a_surface_that_nobody_sees_leaves_light_and_materials(gone):
     scene, steps, photos = sphere_scene(8), Steps(10), photos_of(2, 8)
     steps.skip = lambda: steps.asked.append("skip")
-    photos = dataclasses.replace(photos, alpha=torch.zeros_like(photos.alpha))
+    if gone:
+        scene.field.sdf.data.fill_(1.0)
+    else:
+        photos = dataclasses.replace(photos, alpha=torch.zeros_like(photos.alpha))
+    before = {k: v.clone() for k, v in scene.state_dict().items()}
     joint_solve.solve(scene, photos, JOINT, 0, steps)
     assert steps.asked == ["skip"]
-    assert "no surface point is seen in any photograph" in steps.troubles[0]
+    told = "the field has no surface" if gone else "no surface point is seen in any photograph"
+    assert told in steps.troubles[0]
+    assert all(torch.equal(before[k], v) for k, v in scene.state_dict().items())
 
 
 @pytest.fixture

@@ -183,9 +183,11 @@ def test_where_metal_alone_explains_as_much_there_is_nothing_else(
 ):
     """The less the stages before saw of metal, the more it has to explain."""
     scene, problem = sphere_of((0.12, 0.08, 0.05), 1.0, 0.3)
+    tried = []
 
     def newton_round_(scene, problem, decisions, *_):
-        return NewtonRound([1.0], everywhere if decisions.metal.all() else 1.0)
+        tried.append(bool(decisions.metal.all()))
+        return NewtonRound([1.0], everywhere if tried[-1] else 1.0)
 
     monkeypatch.setattr(initialise, "newton_round_", newton_round_)
     monkeypatch.setattr(initialise, "find_metal", lambda *_: no_metal(problem).metal)
@@ -195,6 +197,7 @@ def test_where_metal_alone_explains_as_much_there_is_nothing_else(
     decisions, _ = initialise_(scene, problem, some_metal(problem, before), cfg, math.inf)
     assert decisions.only_metal == taken
     assert bool(decisions.metal.all()) == taken
+    assert not known or tried == [True]  # of metal alone nothing else is tried
 
 
 def test_grain_makes_no_metal_of_paint():
@@ -207,21 +210,6 @@ def test_grain_makes_no_metal_of_paint():
         grain = noise * torch.randn(problem.target.shape)
         problem = replace(problem, target=(problem.target + grain).clamp(0, 1))
         assert initialised(scene, problem).only_metal == metal
-
-
-def test_of_metal_alone_nothing_else_is_tried(monkeypatch):
-    scene, problem = sphere_of((0.12, 0.08, 0.05), 1.0, 0.3)
-    tried = []
-
-    def newton_round_(scene, problem, decisions, *_):
-        tried.append(bool(decisions.metal.all()))
-        return NewtonRound([1.0], 1.0)
-
-    monkeypatch.setattr(initialise, "newton_round_", newton_round_)
-    known = replace(CFG, only_metal=True)
-    decisions, _ = initialise_(scene, problem, no_metal(problem), known, math.inf)
-    assert decisions.metal.all()
-    assert tried == [True]
 
 
 def test_light_on_metal_alone_is_taken_for_neutral():

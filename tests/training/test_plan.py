@@ -79,6 +79,7 @@ def test_an_adapted_run_says_what_was_chosen_and_is_read_again(run, tmp_path):
     assert found["grid"]["nodes"] <= 6e4
     assert found["grid"]["share_with_distance"] < 1
     assert any("reach 4 -> " in choice["said"] for choice in found["chosen"])
+    assert found["chosen"][0]["said"].startswith("voxels 50,000 -> ")
 
 
 def test_a_scene_drawn_from_an_adapted_file_is_the_one_that_was_trained(run, data):
@@ -86,11 +87,6 @@ def test_a_scene_drawn_from_an_adapted_file_is_the_one_that_was_trained(run, dat
     pixels = torch.cartesian_prod(torch.arange(12), torch.arange(32), torch.arange(32))
     # black gives 9 dB, the right sphere in one mean colour 16
     assert loop.held_out_psnr(load_scene(run), photos, pixels, physical=True) > 17
-
-
-def test_the_log_tells_of_choices(run):
-    state = load_checkpoint(run)[1]
-    assert state["chosen"][0]["said"].startswith("voxels 50,000 -> ")
 
 
 def test_resume_goes_on_with_what_was_chosen(data, tmp_path, monkeypatch):

@@ -120,33 +120,32 @@ def chart(curve: Curve, ends: Sequence[float]) -> str:
     low, high = low - margin, high + margin
     last = max([x for x, _ in points] + list(ends)) or 1.0
 
-    def place(x: float, y: float) -> str:
-        across = LEFT + (WIDTH - LEFT - 8) * x / last
-        down = TOP + (HEIGHT - TOP - BOTTOM) * (high - _scaled(curve, y)) / (high - low)
-        return f"{across:.1f},{down:.1f}"
+    def across(x: float) -> str:
+        return f"{LEFT + (WIDTH - LEFT - 8) * x / last:.1f}"
+
+    def down(scaled: float) -> str:
+        return f"{TOP + (HEIGHT - TOP - BOTTOM) * (high - scaled) / (high - low):.1f}"
 
     title = escape(curve.title)
     parts = [f'<text x="{LEFT:.0f}" y="10" text-anchor="start" fill="{INK}">{title}</text>']
     floor = HEIGHT - BOTTOM
     for value in _ticks(low, high):
-        shown = 10**value if curve.logarithmic else value
-        y = place(0.0, shown).split(",")[1]
+        y, shown = down(value), 10**value if curve.logarithmic else value
         parts.append(f'<path d="M{LEFT:.0f} {y}H{WIDTH - 8:.0f}" stroke="{GRID}"/>')
         parts.append(f'<text x="{LEFT - 6:.0f}" y="{y}" dy="4" {NUMBER}>{shown:.2g}</text>')
-    for end in ends:
-        x = place(end, points[0][1]).split(",")[0]
+    for x in map(across, ends):
         parts.append(
             f'<path d="M{x} {TOP}V{floor}" stroke="{STAGE}" stroke-dasharray="3 3" class="stage"/>'
         )
     for x in _ticks(0.0, last):
-        across = place(x, points[0][1]).split(",")[0]
-        parts.append(f'<text x="{across}" y="{HEIGHT - 8:.0f}">{x:g} s</text>')
+        parts.append(f'<text x="{across(x)}" y="{HEIGHT - 8:.0f}">{x:g} s</text>')
     for piece in curve.pieces:
-        if len(piece) == 1:
-            x, y = place(*piece[0]).split(",")
+        placed = [(across(x), down(_scaled(curve, y))) for x, y in piece]
+        if len(placed) == 1:
+            x, y = placed[0]
             parts.append(f'<circle cx="{x}" cy="{y}" r="2.5" fill="{LINE}" class="point"/>')
-        elif piece:
-            line = " ".join(place(x, y) for x, y in piece)
+        elif placed:
+            line = " ".join(map(",".join, placed))
             parts.append(
                 f'<polyline points="{line}" fill="none" stroke="{LINE}" stroke-width="1.8"/>'
             )

@@ -87,9 +87,8 @@ class Bricks:
 
     def corners(self, brick: Tensor) -> Tensor:
         """First node of bricks [K] that stand somewhere: [K, 3] int64."""
-        _, b, c = self.table.shape
-        at = self.place[brick].long()
-        return torch.stack([at // (b * c), at // c % b, at % c], -1) * self.SIDE
+        at = torch.unravel_index(self.place[brick].long(), self.table.shape)
+        return torch.stack(at, -1) * self.SIDE
 
     def rows(self, node: Tensor) -> Tensor:
         """Rows of nodes [..., 3] int64 of the grid: [...] int64."""

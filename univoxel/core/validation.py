@@ -144,13 +144,13 @@ def check_fields(config: object, wanted: str, holds: Callable[[Any], bool], *nam
     Args:
         config: a dataclass.
         wanted: the range in words, such as "at least 1".
-        holds: whether a value is in it; a TypeError counts as no.
+        holds: whether a value is in it; a TypeError or UnicodeError counts as no.
     """
     for name in names:
         value = getattr(config, name)
         try:
             held = holds(value)
-        except TypeError:
+        except (TypeError, UnicodeError):
             held = False
         if not held:
             raise ConfigError(f"{type(config).__name__}: {name} must be {wanted}, got {value!r}")
@@ -256,17 +256,16 @@ def _replaced(node: Any, path: list[str], text: str) -> Any:
     if not path:
         return _value(node, text)
     name, *rest = path
-    known = [str(i) for i in range(len(node))] if isinstance(node, tuple) else _field_names(node)
+    if isinstance(node, tuple):
+        known = [str(i) for i in range(len(node))]
+    else:
+        known = [f.name for f in _fields(node)] if dataclasses.is_dataclass(node) else []
     if name not in known:
         raise ConfigError(f"no field {name!r}; the fields are: {', '.join(known) or 'none'}")
     if isinstance(node, tuple):
         i = int(name)
         return (*node[:i], _replaced(node[i], rest, text), *node[i + 1 :])
     return dataclasses.replace(node, **{name: _replaced(getattr(node, name), rest, text)})
-
-
-def _field_names(node) -> list[str]:
-    return [f.name for f in dataclasses.fields(node)] if dataclasses.is_dataclass(node) else []
 
 
 def _value(old, text: str):

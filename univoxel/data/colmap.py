@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from univoxel.data.conventions import TO_OPENGL, find_photo, listed_split, turned_up
 from univoxel.data.images import image_size, turn_note
@@ -146,9 +147,7 @@ def read_images(path: Path) -> list[Registered]:
         length = np.linalg.norm(quaternion) if largest < 2 else largest
         if not 0.5 < length < 2 or not np.abs(translation).max() <= FARTHEST:
             raise ValueError(f"the pose of {name} is invalid: {quaternion}, {translation}")
-        w, x, y, z = np.asarray(quaternion) / length
-        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        to_camera = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+        to_camera = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
         position = -to_camera.T @ np.asarray(translation)
         pose = np.concatenate([to_camera.T @ TO_OPENGL, position[:, None]], 1)
         images.append(Registered(camera, name, pose))

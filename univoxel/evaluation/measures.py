@@ -346,14 +346,11 @@ def score(layers: Layers, expected: Expected, scales: Scales) -> list[tuple[str,
         found.append(("relit_psnr_raw", metrics.psnr(linear_to_srgb(raw), photo)))
     mask = truth.mask if truth.mask is not None and truth.mask.any() else None
     if expected.albedo is not None:
-        aligned = linear_to_srgb(layers.albedo * scales.three)
-        one = linear_to_srgb(layers.albedo * scales.one)
-        raw = linear_to_srgb(layers.albedo)
-        found.append(("albedo_psnr_raw", metrics.psnr(raw, expected.albedo)))
-        found.append(("albedo_psnr_1ch", metrics.psnr(one, expected.albedo)))
-        found.append(("albedo_psnr_3ch", metrics.psnr(aligned, expected.albedo)))
-        if mask is not None:
-            found.append(("albedo_psnr_fg", metrics.psnr(aligned, expected.albedo, mask)))
+        counted = {"raw": (1.0, None), "1ch": (scales.one, None), "3ch": (scales.three, None)}
+        counted |= {} if mask is None else {"fg": (scales.three, mask)}
+        for name, (scale, where) in counted.items():
+            picture = linear_to_srgb(layers.albedo * scale)
+            found.append((f"albedo_psnr_{name}", metrics.psnr(picture, expected.albedo, where)))
     if truth.roughness is not None and mask is not None:
         error = metrics.roughness_mse(layers.roughness, truth.roughness, mask)
         found.append(("roughness_mse", error))
@@ -364,11 +361,20 @@ def score(layers: Layers, expected: Expected, scales: Scales) -> list[tuple[str,
 
 def errors_of(layers: Layers, expected: Expected, scales: Scales) -> dict[str, Pairs]:
     """Expected and true errors in the mask of a view by quantity, None where there is no truth."""
-    truth = expected.truth
     found: dict[str, Pairs] = dict.fromkeys(QUANTITIES)
-    if layers.errors is None or truth.mask is None:
+    if layers.errors is None or expected.truth.mask is None:
         return found
-    true = {}
+    true = true_errors(layers, expected, scales)
+    there = expected.truth.mask & (layers.alpha > 0)
+    for k, name in enumerate(QUANTITIES):
+        if name in true:
+            found[name] = layers.errors[there][:, k], true[name][there]
+    return found
+
+
+def true_errors(layers: Layers, expected: Expected, scales: Scales) -> dict[str, Tensor]:
+    """Errors [H, W] of a view by quantity, as far as there is truth."""
+    truth, true = expected.truth, {}
     if expected.albedo is not None:
         difference = linear_to_srgb(layers.albedo * scales.three) - expected.albedo
         true["albedo"] = difference.abs().mean(-1)
@@ -377,11 +383,7 @@ def errors_of(layers: Layers, expected: Expected, scales: Scales) -> dict[str, P
     if truth.normal is not None:
         cosine = (layers.normal * truth.normal).sum(-1).clamp(-1, 1)
         true["normal"] = cosine.acos().rad2deg()
-    there = truth.mask & (layers.alpha > 0)
-    for k, name in enumerate(QUANTITIES):
-        if name in true:
-            found[name] = layers.errors[there][:, k], true[name][there]
-    return found
+    return true
 
 
 def rank_correlation(pairs: list[Pairs]) -> float | None:

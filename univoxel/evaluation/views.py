@@ -43,6 +43,7 @@ from univoxel.evaluation.measures import (
     fit_light_,
     render_layers,
     score,
+    true_errors,
 )
 from univoxel.render.pictures import Panel, contact_sheet, heat, shrink
 from univoxel.render.relight import Lighting, traced_mesh
@@ -133,18 +134,11 @@ def panels_of_view(layers: Layers, expected: Expected, scales: Scales) -> list[P
     def mapped(normal: Tensor) -> Tensor:
         return 0.5 * normal + 0.5 * (normal != 0).any(-1, keepdim=True)
 
-    rough, bent = None, None
-    if truth.roughness is not None and mask is not None:
-        rough = (layers.roughness - truth.roughness).abs() * mask
-    if truth.normal is not None and mask is not None:
-        cosine = (layers.normal * truth.normal).sum(-1).clamp(-1, 1)
-        bent = cosine.acos().rad2deg() * mask
+    true = {} if mask is None else true_errors(layers, expected, scales)
+    rough, bent = (true[name] * mask if name in true else None for name in ("roughness", "normal"))
+    shown = layers.rgb + expected.behind * (1 - layers.alpha[..., None])
     panels = [
-        colors(
-            "novel view",
-            layers.rgb + expected.behind * (1 - layers.alpha[..., None]),
-            expected.photo,
-        ),
+        colors("novel view", shown, expected.photo),
         colors("albedo, scaled", layers.albedo * scales.three, expected.albedo),
         Panel(
             "roughness",
@@ -165,10 +159,8 @@ def panels_of_view(layers: Layers, expected: Expected, scales: Scales) -> list[P
     if layers.errors is not None:  # in the colours of the errors that they should predict
         albedo = torch.from_numpy(heat(layers.errors[..., 0], COLOR_LIMIT))
         rough = torch.from_numpy(heat(layers.errors[..., 1], ROUGHNESS_LIMIT))
-        heads = ("expected roughness error", "albedo error")
-        error = panels[1].error
-        title = "expected albedo error"
-        panels.append(Panel(title, albedo, rough, error, COLOR_LIMIT, heads=heads))
+        predicted = "expected albedo error", albedo, rough, panels[1].error, COLOR_LIMIT
+        panels.append(Panel(*predicted, heads=("expected roughness error", "albedo error")))
     panels += [
         colors(f"under {name}", layers.relit_scaled[name], photo)
         for name, photo in expected.relit.items()

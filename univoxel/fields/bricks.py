@@ -87,10 +87,7 @@ class BrickDistances(AbstractDistances):
             stored = stored.narrow(axis, 0, n) | stored.narrow(axis, 1, n)
         return stored
 
-    def on_grid(self, values: Tensor) -> Tensor:
-        return self._slab(values)
-
-    def _slab(self, values: Tensor, begin: int = 0, end: int | None = None) -> Tensor:
+    def on_grid(self, values: Tensor, begin: int = 0, end: int | None = None) -> Tensor:
         """Values [R, ...] of the rows at all nodes from plane `begin` to before `end`:
         [end - begin, Y, Z, ...]; begin is where a brick begins."""
         channels, (x, y, z) = values.shape[1:], self.grid.size
@@ -111,7 +108,7 @@ class BrickDistances(AbstractDistances):
             raise NoSurface("the field has no surface: its sdf does not change sign")
         parts = []
         for begin in range(0, planes - 1, SLAB):  # the whole grid would take much memory
-            slab = self._slab(values, begin, begin + SLAB + 1).numpy()
+            slab = self.on_grid(values, begin, begin + SLAB + 1).numpy()
             start = np.array([begin, 0, 0], np.float32)
             if closed:  # slabs meet inside the grid: the first has a rim before it, the last after
                 ends = int(begin == 0), int(begin + SLAB + 1 >= planes)
@@ -250,12 +247,9 @@ def _overlapped(source: AbstractDistances, grid: GridShape, far: float) -> Tenso
 def pack_bricks(distances: BrickDistances) -> dict[str, Tensor]:
     """What of the bricks a file needs: where they stand, and bits of what is inside."""
     inside = (distances.bricks.table == 1).flatten()
-    bits = torch.nn.functional.pad(inside, (0, -len(inside) % 8)).view(-1, 8).to(torch.uint8)
-    weights = 2 ** torch.arange(8, dtype=torch.uint8)
-    return {
-        "place": distances.bricks.place[: distances.count].clone(),
-        "inside": (bits * weights).sum(1, dtype=torch.uint8),
-    }
+    bits = np.packbits(inside.numpy(), bitorder="little")
+    place = distances.bricks.place[: distances.count].clone()
+    return {"place": place, "inside": torch.from_numpy(bits)}
 
 
 def unpack_bricks(place: Tensor, inside: Tensor, size: tuple[int, int, int]) -> Bricks:

@@ -185,7 +185,9 @@ class HashFeatures(AbstractFeatures):
     def at(
         self, distances: AbstractDistances, points: Tensor, values: Tensor | None = None
     ) -> Tensor:
-        return self._by_channel(self.encode(points, values))
+        table = self.values if values is None else values
+        encoded = encode_hash(table, points, *self._lattices, sparse_grad=True)
+        return self._by_channel(encoded)
 
     def _by_channel(self, encoded: Tensor) -> Tensor:
         """Features [N, C] from those of a level together."""
@@ -202,11 +204,6 @@ class HashFeatures(AbstractFeatures):
     @property
     def _lattices(self) -> Lattices:
         return self.levels.lower, self.levels.upper, self.levels.voxel_sizes
-
-    def encode(self, points: Tensor, values: Tensor | None = None) -> Tensor:
-        """The features [M, C], those of a level together; values as in `at`."""
-        table = self.values if values is None else values
-        return encode_hash(table, points, *self._lattices, sparse_grad=True)
 
     def hold_channels_(self, count: int) -> None:
         grad = self.values.grad

@@ -204,16 +204,9 @@ def sample_dense(
         raise ValueError(f"sample_dense: sdf must not be empty, got {list(sdf.shape)}")
     check_place("sample_dense", sizes["M"], origin, voxel_size)
     if native.serves(sdf):
-        return _sample_dense(
-            sdf.contiguous(),
-            features.contiguous(),
-            no_table(sdf),
-            points.contiguous(),
-            list(sdf.shape),
-            [float(x) for x in origin],
-            float(voxel_size),
-            sparse_grad,
-        )[:3]
+        tensors = (t.contiguous() for t in (sdf, features, no_table(sdf), points))
+        place = list(sdf.shape), [float(x) for x in origin], float(voxel_size)
+        return _sample_dense(*tensors, *place, sparse_grad)[:3]
     if sparse_grad:
         sdf, features = SparseGrad.apply(sdf, 3), SparseGrad.apply(features, 3)
     return sample_dense_reference(sdf, features, points, origin, voxel_size)
@@ -295,16 +288,9 @@ def sample_sparse(
         raise ValueError(f"sample_sparse: bricks must not be empty, got size {list(bricks.size)}")
     check_place("sample_sparse", sizes["M"], origin, voxel_size)
     if native.serves(sdf):
-        return _sample_sparse(
-            sdf.contiguous(),
-            features.contiguous(),
-            bricks.table,
-            points.contiguous(),
-            list(bricks.size),
-            [float(x) for x in origin],
-            float(voxel_size),
-            sparse_grad,
-        )[:3]
+        tensors = (t.contiguous() for t in (sdf, features, bricks.table, points))
+        place = list(bricks.size), [float(x) for x in origin], float(voxel_size)
+        return _sample_sparse(*tensors, *place, sparse_grad)[:3]
     if sparse_grad:
         sdf, features = SparseGrad.apply(sdf, 1), SparseGrad.apply(features, 1)
     return sample_sparse_reference(sdf, features, bricks, points, origin, voxel_size)

@@ -150,10 +150,11 @@ def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) ->
 def _backward(
     saved: Sequence, grads: Sequence[Tensor], options: Sequence, needs: list[bool]
 ) -> Sequence[Tensor]:
-    return (grads[0][..., None] * saved[0]).sum(1).split(3, 1)
+    both = (grads[0][..., None] * saved[-1]).sum(1)
+    return [part.contiguous() for part in both.split(3, 1)]
 
 
-@differentiable(to="position normal", forward=_forward, backward=_backward, held=1, traced=True)
+@differentiable(to="position normal", forward=_forward, backward=_backward, held=1)
 def _patch_correlation(
     brightness: Tensor,
     projection: Tensor,

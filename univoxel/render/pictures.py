@@ -44,10 +44,8 @@ class Panel:
 
 def heat(error: Tensor, limit: float) -> np.ndarray:
     """Errors [H, W] as colours [H, W, 3] in [0, 1]: black is 0, near white is `limit` or more."""
-    x = np.clip(error.numpy() / limit, 0, 1) * (len(HEAT) - 1)
-    low = np.minimum(x.astype(np.int64), len(HEAT) - 2)
-    f = (x - low)[..., None]
-    return (1 - f) * HEAT[low] + f * HEAT[low + 1]
+    x, steps = error.numpy() / limit, np.linspace(0, 1, len(HEAT))
+    return np.stack([np.interp(x, steps, channel) for channel in HEAT.T], -1)
 
 
 def contact_sheet(rows: list[tuple[str, list[Panel]]]) -> np.ndarray:
@@ -96,16 +94,8 @@ def contact_sheet(rows: list[tuple[str, list[Panel]]]) -> np.ndarray:
 def shrink(panel: Panel) -> Panel:
     """The panel at about the size it is drawn in, so that sheets of large views fit in memory."""
     every = max(1, min(panel.estimate.shape[:2]) // (2 * TILE))
-
-    def small(x: Tensor | None) -> Tensor | None:
-        return None if x is None else x[::every, ::every].clone()
-
-    return replace(
-        panel,
-        estimate=panel.estimate[::every, ::every].clone(),
-        truth=small(panel.truth),
-        error=small(panel.error),
-    )
+    tensors = {name: x for name, x in vars(panel).items() if isinstance(x, Tensor)}
+    return replace(panel, **{name: x[::every, ::every].clone() for name, x in tensors.items()})
 
 
 def _tile_size(picture: Tensor) -> tuple[int, int]:

@@ -270,24 +270,19 @@ class Quality:
     ground: float | None = None  # z of a floor that catches the shadow, world units
 
     def __post_init__(self) -> None:
-        for name, value, ok in (
-            ("samples must be at least 1", self.samples, self.samples >= 1),
-            ("samples must be at most 2^31", self.samples, self.samples <= 2**31),
-            ("noise must be above 0", self.noise, self.noise is None or self.noise > 0),
-            ("bounces must be at least 0", self.bounces, self.bounces >= 0),
-            (
-                "background must be transparent, map or black",
-                self.background,
-                self.background in get_args(Background),
-            ),
-            (
-                "ground must be finite",
-                self.ground,
-                self.ground is None or math.isfinite(self.ground),
-            ),
-        ):
+        noise, ground, known = self.noise, self.ground, get_args(Background)
+        allowed = {
+            "samples must be at least 1": self.samples >= 1,
+            "samples must be at most 2^31": self.samples <= 2**31,
+            "noise must be above 0": noise is None or noise > 0,
+            "bounces must be at least 0": self.bounces >= 0,
+            "background must be transparent, map or black": self.background in known,
+            "ground must be finite": ground is None or math.isfinite(ground),
+        }
+        for said, ok in allowed.items():
             if not ok:
-                raise UserError(f"relight: {name}, got {value!r}", name.split()[0])
+                name = said.split()[0]
+                raise UserError(f"relight: {said}, got {getattr(self, name)!r}", name)
 
 
 @dataclass(frozen=True)
@@ -371,12 +366,9 @@ def channels(picture: Picture) -> dict[str, Tensor]:
     for name in ("shadow", "metallic"):
         if (layer := getattr(picture, name)) is not None:
             out[name] = layer
-    for name, value, letters in (
-        ("rgb", picture.rgb, "RGB"),
-        ("albedo", picture.albedo, "RGB"),
-        ("normal", picture.normal, "XYZ"),
-    ):
-        out |= {f"{name}.{c}": value[..., k] for k, c in enumerate(letters)}
+    for name, letters in (("rgb", "RGB"), ("albedo", "RGB"), ("normal", "XYZ")):
+        layer = getattr(picture, name)
+        out |= {f"{name}.{c}": layer[..., k] for k, c in enumerate(letters)}
     return out
 
 
