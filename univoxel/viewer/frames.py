@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from importlib.util import find_spec
+from itertools import chain, repeat
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
@@ -32,37 +33,6 @@ _BESIDE = ThreadPoolExecutor(1, "univoxel denoiser")
 def available() -> bool:
     """Whether the extra `denoise` is installed."""
     return find_spec("pyoidn") is not None
-
-
-def denoised_beside(
-    rgb: Tensor, albedo: Tensor, normal: Tensor, shadow: Tensor | None
-) -> Future[tuple[Tensor, Tensor | None]]:
-    """`denoised` in a thread of its own, of the values as they are now."""
-    copies = (rgb.clone(), albedo.clone(), normal.clone())
-    return _BESIDE.submit(denoised, *copies, None if shadow is None else shadow.clone())
-
-
-def denoised(
-    rgb: Tensor, albedo: Tensor, normal: Tensor, shadow: Tensor | None
-) -> tuple[Tensor, Tensor | None]:
-    """Radiance without its noise, and a floor's shadow likewise.
-
-    Args:
-        rgb: [H, W, 3] linear.
-        albedo, normal: [H, W, 3], free of noise, 0 if there is no surface.
-        shadow: [H, W] in [0, 1].
-    """
-    import pyoidn  # pyright: ignore[reportMissingImports]  the extra `denoise`
-
-    def array(values: Tensor) -> np.ndarray:
-        return np.ascontiguousarray(values.numpy(), np.float32)
-
-    aside = {"albedo": array(albedo), "normal": array(normal)}
-    light = torch.from_numpy(pyoidn.denoise(array(rgb), **aside, hdr=True)).clamp_min(0)
-    if shadow is None:
-        return light, None
-    grey = pyoidn.denoise(array(shadow[..., None].expand(-1, -1, 3)))
-    return light, torch.from_numpy(grey)[..., 0].clamp(0, 1)
 
 
 Layer: TypeAlias = Literal[
@@ -199,41 +169,40 @@ def _denoised(
     running: Future[Light] | None = None
     waiting: Light | None = None
     clean = False
-    for found in passes:
-        if found is not None:
+    for found, over in chain(((light, False) for light in passes), repeat((None, True))):
+        if over:
+            if running is None:
+                return
+            wait([running], WAIT_SECONDS)
+        elif found is not None:
             waiting = found
             if not clean:
                 yield found
         if running is not None and running.done():
-            yield _flat(*running.result())
+            yield running.result()
             running, clean = None, True
         if running is None and waiting is not None:
-            running = denoised_beside(*_guided(cameras, surface, *waiting))
-            waiting = None
-        yield None
-    while running is not None:
-        wait([running], WAIT_SECONDS)
-        if running.done():
-            yield _flat(*running.result())
-            running = None
-        if running is None and waiting is not None:
-            running = denoised_beside(*_guided(cameras, surface, *waiting))
-            waiting = None
+            rgb, shadow = waiting  # which the next passes change
+            copies = rgb.clone(), None if shadow is None else shadow.clone()
+            running, waiting = _BESIDE.submit(_without_noise, cameras, surface, *copies), None
         yield None
 
 
-def _guided(
-    cameras: Cameras, surface: Surface, rgb: Tensor, shadow: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """What a denoiser takes: pictures of light, albedo and normals; and of the shadow."""
+def _without_noise(cameras: Cameras, surface: Surface, rgb: Tensor, shadow: Tensor | None) -> Light:
+    """The light of pixels, linear, and a floor's shadow, guided by albedo and normals."""
+    import pyoidn  # pyright: ignore[reportMissingImports]  the extra `denoise`
+
+    def array(values: Tensor) -> np.ndarray:
+        return np.ascontiguousarray(_grid(cameras, values).numpy(), np.float32)
+
     hit = surface.opacity[:, None] > 0
-    parts = [rgb, torch.where(hit, surface.albedo, 0), torch.where(hit, surface.normal, 0)]
-    light, albedo, normal = (_grid(cameras, part) for part in parts)
-    return light, albedo, normal, None if shadow is None else _grid(cameras, shadow)[..., 0]
-
-
-def _flat(rgb: Tensor, shadow: Tensor | None) -> Light:
-    return rgb.reshape(-1, 3), None if shadow is None else shadow.reshape(-1)
+    guides = {"albedo": surface.albedo, "normal": surface.normal}
+    aside = {name: array(torch.where(hit, values, 0)) for name, values in guides.items()}
+    light = torch.from_numpy(pyoidn.denoise(array(rgb), **aside, hdr=True)).clamp_min(0)
+    if shadow is None:
+        return light.reshape(-1, 3), None
+    grey = torch.from_numpy(pyoidn.denoise(array(shadow[:, None].expand(-1, 3))))
+    return light.reshape(-1, 3), grey[..., 0].clamp(0, 1).reshape(-1)
 
 
 def _accumulated_(
