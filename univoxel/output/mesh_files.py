@@ -23,18 +23,6 @@ from univoxel.errors import MissingExtra, UserError
 from univoxel.output.mesh import Y_UP, TexturedMesh, encoded, texture_pictures
 
 
-def write_glb(path: Path, mesh: TexturedMesh, jpeg: int | None = None) -> None:
-    """Write a textured mesh as GLB, turned to +Y up, whole or not at all.
-
-    Args:
-        jpeg: as in `glb`.
-
-    Raises:
-        OSError: the file cannot be written; nothing is left behind.
-    """
-    write_bytes(path, glb(mesh, jpeg))
-
-
 def glb(
     mesh: TexturedMesh, jpeg: int | None = None, extra: Mapping[str, Tensor] | None = None
 ) -> bytes:
@@ -191,18 +179,15 @@ def write_usdz(path: Path, mesh: TexturedMesh, jpeg: int | None = None) -> None:
         pictures = _write_pictures(folder, mesh, jpeg)
         layer = folder / "object.usdc"
         _write_stage(usd, layer, mesh, pictures)
-        package = folder / "object.usdz"
-        _write_package(usd, package, [layer, *(folder / file for file in pictures.values())])
+        # The layer first, aligned and not compressed, as the format asks for
+        package, module = folder / "object.usdz", usd.Sdf
+        if not hasattr(module, "ZipFileWriter"):
+            module = usd.Usd
+        writer = module.ZipFileWriter.CreateNew(str(package))
+        for file in (layer.name, *pictures.values()):
+            writer.AddFile(str(folder / file), file)
+        writer.Save()
         write_bytes(path, package.read_bytes())
-
-
-def _write_package(usd: Any, package: Path, files: list[Path]) -> None:
-    """An archive of files, the layer first, aligned and not compressed as the format asks for."""
-    kind: Any = getattr(usd.Sdf, "ZipFileWriter", None) or getattr(usd.Usd, "ZipFileWriter", None)
-    writer = kind.CreateNew(str(package))
-    for file in files:
-        writer.AddFile(str(file), file.relative_to(package.parent).as_posix())
-    writer.Save()
 
 
 def _write_pictures(folder: Path, mesh: TexturedMesh, jpeg: int | None) -> dict[str, str]:
