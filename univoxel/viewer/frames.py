@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -133,28 +133,27 @@ def _passes(
     done, number = 0, 0
     while done < samples:
         more = min(PASSES[min(number, len(PASSES) - 1)], samples - done)
-
-        def traced(index: Tensor, done: int = done, more: int = more) -> Tensor:
-            return relight_surface(
-                at_rays(surface, index),
-                wo[index],
+        share = more / (done + more)
+        for some in _steps(hit, more):
+            found = relight_surface(
+                at_rays(surface, some),
+                wo[some],
                 subject.traced,
                 look.lighting,
                 samples=more,
                 bounces=BOUNCES,
                 first=done,
-                seed=int(index[0]),  # other noise than in other steps
+                seed=int(some[0]),  # other noise than in other steps
             )
-
-        def darkened(index: Tensor, more: int = more, number: int = number) -> Tensor:
-            some, hidden = _at(rays, index), torch.zeros(len(index), dtype=torch.bool)
-            seed = (int(index[0]) + 0x9E3779B9 * number) % 2**32
-            return _shadow(subject, look, some, hidden, more, BOUNCES, seed)
-
-        share = more / (done + more)
-        yield from _accumulated_(rgb, hit, traced, share, more)
+            rgb[some] += share * (found - rgb[some])
+            yield None
         if shadow is not None:
-            yield from _accumulated_(shadow, floor, darkened, share, 2 * more)
+            for some in _steps(floor, 2 * more):
+                hidden = torch.zeros(len(some), dtype=torch.bool)
+                seed = (int(some[0]) + 0x9E3779B9 * number) % 2**32
+                found = _shadow(subject, look, _at(rays, some), hidden, more, BOUNCES, seed)
+                shadow[some] += share * (found - shadow[some])
+                yield None
         done, number = done + more, number + 1
         yield rgb, shadow
 
@@ -205,14 +204,9 @@ def _without_noise(cameras: Cameras, surface: Surface, rgb: Tensor, shadow: Tens
     return light.reshape(-1, 3), grey[..., 0].clamp(0, 1).reshape(-1)
 
 
-def _accumulated_(
-    mean: Tensor, index: Tensor, render: Callable[[Tensor], Tensor], share: float, samples: int
-) -> Iterator[None]:
-    """Take another pass into the mean of some pixels, in steps; None after each."""
-    for some in index.split(max(1, STEP_PATHS // samples)):
-        if len(some):
-            mean[some] += share * (render(some) - mean[some])
-        yield None
+def _steps(pixels: Tensor, samples: int) -> Iterable[Tensor]:
+    """Pixels in parts of a step each."""
+    return pixels.split(max(1, STEP_PATHS // samples)) if len(pixels) else ()
 
 
 def _at(rays: Rays, index: Tensor) -> Rays:
