@@ -258,17 +258,13 @@ def _layer(subject: Subject, cameras: Cameras, layer: Layer, surface: Surface) -
             metal = metal_or_none(surface.metallic)
             metal = torch.zeros_like(surface.depth) if metal is None else metal
             values = metal[:, None].expand(-1, 3)
-        case _:
-            values = _nearness(subject, cameras, surface)[:, None].expand(-1, 3)
+        case _:  # depth along -Z: 1 at the object's nearest point, 0 at its farthest
+            place, back = cameras.camera_to_world[0, :, 3], cameras.camera_to_world[0, :, 2]
+            ends = -(subject.traced.mesh.vertices - place) @ back
+            depth = -(surface.position - place) @ back
+            nearness = 1 - (depth - ends.min()) / (ends.max() - ends.min()).clamp_min(1e-9)
+            values = nearness[:, None].expand(-1, 3)
     return _grid(cameras, torch.cat([values.clamp(0, 1), surface.opacity[:, None]], 1))
-
-
-def _nearness(subject: Subject, cameras: Cameras, surface: Surface) -> Tensor:
-    """Depth along -Z [N] as brightness: 1 at the object's nearest point, 0 at its farthest."""
-    pose = cameras.camera_to_world[0]
-    ends = -(subject.traced.mesh.vertices - pose[:, 3]) @ pose[:, 2]
-    depth = -(surface.position - pose[:, 3]) @ pose[:, 2]
-    return 1 - (depth - ends.min()) / (ends.max() - ends.min()).clamp_min(1e-9)
 
 
 def _grid(cameras: Cameras, values: Tensor) -> Tensor:

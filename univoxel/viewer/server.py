@@ -69,7 +69,10 @@ def serving(
     options = replace(options, title=title)
     with hosted(host, port, title) as server:
         lights = lights_of(subject.scene, options)
-        _start_camera(server, subject)
+        start = orbit(subject.traced.mesh, 8, 512).camera_to_world[1, :, 3]
+        server.initial_camera.position = start.numpy()
+        server.initial_camera.look_at = torch.stack(subject.bounds).mean(0).numpy()
+        server.initial_camera.fov = math.radians(VIEW_ANGLE)
         studio = Studio(subject)
         clients: dict[int, Viewer] = {}
 
@@ -410,11 +413,3 @@ def laid_over(rgb: Tensor, photos: Photos, view: int, cameras: Cameras, share: f
     over = share * alpha[:, None]
     flat[where] = (1 - over) * flat[where] + over * linear_to_srgb(color)
     return flat.reshape(rgb.shape)
-
-
-def _start_camera(server: Any, subject: Subject) -> None:
-    cameras = orbit(subject.traced.mesh, 8, 512)
-    pose = cameras.camera_to_world[1]
-    server.initial_camera.position = pose[:, 3].numpy()
-    server.initial_camera.look_at = torch.stack(subject.bounds).mean(0).numpy()
-    server.initial_camera.fov = math.radians(VIEW_ANGLE)
