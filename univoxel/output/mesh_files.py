@@ -178,7 +178,16 @@ def write_usdz(path: Path, mesh: TexturedMesh, jpeg: int | None = None) -> None:
         folder = Path(name)
         pictures = _write_pictures(folder, mesh, jpeg)
         layer = folder / "object.usdc"
-        _write_stage(usd, layer, mesh, pictures)
+        stage = usd.Usd.Stage.CreateNew(str(layer))
+        usd.UsdGeom.SetStageUpAxis(stage, usd.UsdGeom.Tokens.y)
+        usd.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        stage.GetRootLayer().documentation = f"univoxel {__version__}"
+        root = usd.UsdGeom.Xform.Define(stage, ROOT)
+        stage.SetDefaultPrim(root.GetPrim())
+        usd.Usd.ModelAPI(root.GetPrim()).SetKind("component")
+        _define_material(usd, stage, pictures)
+        _define_mesh(usd, stage, mesh)
+        stage.GetRootLayer().Save()
         # The layer first, aligned and not compressed, as the format asks for
         package, module = folder / "object.usdz", usd.Sdf
         if not hasattr(module, "ZipFileWriter"):
@@ -199,19 +208,6 @@ def _write_pictures(folder: Path, mesh: TexturedMesh, jpeg: int | None) -> dict[
         files[kind] = f"textures/{kind}.{'png' if jpeg is None else 'jpg'}"
         (folder / files[kind]).write_bytes(encoded(picture, jpeg))
     return files
-
-
-def _write_stage(usd: Any, layer: Path, mesh: TexturedMesh, pictures: dict[str, str]) -> None:
-    stage = usd.Usd.Stage.CreateNew(str(layer))
-    usd.UsdGeom.SetStageUpAxis(stage, usd.UsdGeom.Tokens.y)
-    usd.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    stage.GetRootLayer().documentation = f"univoxel {__version__}"
-    root = usd.UsdGeom.Xform.Define(stage, ROOT)
-    stage.SetDefaultPrim(root.GetPrim())
-    usd.Usd.ModelAPI(root.GetPrim()).SetKind("component")
-    _define_material(usd, stage, pictures)
-    _define_mesh(usd, stage, mesh)
-    stage.GetRootLayer().Save()
 
 
 def _define_mesh(usd: Any, stage: Any, mesh: TexturedMesh) -> None:
