@@ -21,6 +21,7 @@ import univoxel
 from univoxel import cli, errors
 from univoxel.capture.config import DEFAULTS, FAST
 from univoxel.cli import COMMANDS, LABORATORY, SPINS, laboratory, main, take_threads
+from univoxel.cli.capture import CaptureOptions
 from univoxel.cli.parsing import meanings, takes
 from univoxel.config import save_config
 from univoxel.errors import ExistingFile, MissingExtra, MissingFile, ProcessFailed, UserError
@@ -115,7 +116,7 @@ def test_capture_until_a_step(calls, capsys):
     calls.give("univoxel.cli.capture", find_data=find)
     assert main(["capture", "photos", "--out", "mug", "--until", "masks"]) == 0
     assert capsys.readouterr().out == "mug/cut\n"
-    assert calls.noted[0][2] == {"masks": "auto", "until": "masks", **USUAL}
+    assert calls.noted[0][2] == vars(CaptureOptions(Path("photos"), Path("mug"), until="masks"))
     assert main(["capture", "photos", "--out", "mug", "--until", "cameras", "--minutes", "2"]) == 2
     said = "--until cameras does not train: leave out --preset, --light, --minutes and --set"
     assert said in capsys.readouterr().err
@@ -125,9 +126,9 @@ def test_capture(calls, capsys):
     options = ["--masks", "rembg", "--preset", "draft", "--light", "sg", "--minutes", "2"]
     assert main(["capture", "photos", "--out", "mug", *options, "--set=seed=3"]) == 0
     assert capsys.readouterr().out == "mug/index.html\nmug/mug.glb\n"
-    told = {"masks": "rembg", "preset": "draft", "light": "sg", "minutes": 2.0}
-    expected = {**told, **USUAL, "changes": ("seed=3",)}
-    assert calls.noted == [("capture", (Path("photos"), Path("mug")), expected)]
+    told: dict = {"masks": "rembg", "preset": "draft", "light": "sg", "minutes": 2.0}
+    asked = CaptureOptions(Path("photos"), Path("mug"), **told, changes=("seed=3",))
+    assert calls.noted == [("capture", (), vars(asked))]
     assert main(["capture", "photos", "--out", "mug", "--minutes", "0"]) == 2
     assert "--minutes must be above 0" in capsys.readouterr().err
     calls.replace("capture", KeyboardInterrupt())

@@ -155,11 +155,11 @@ def test_transfer_is_the_light_that_a_path_tracer_finds():
     albedo = (0.9, 0.5, 0.2)
     mesh = mesh_of(vertices, faces, albedo)
     offset = 0.1 * scene.field.voxel_size
-    found = transfer(mesh, offset)
+    direct, bounced = transfer(mesh, offset)
     direction = latlong_directions(32)
     radiance = 1 + direction @ torch.tensor([[0.5, 0.1, 0], [0.2, 0.5, 0], [-0.3, 0.1, 0.6]])
     numbers = page.harmonics(radiance)
-    ours = found.direct @ numbers + torch.einsum("pck,kc->pc", found.bounced, numbers[:4])
+    ours = direct @ numbers + torch.einsum("pck,kc->pc", bounced, numbers[:4])
 
     some = torch.randperm(len(vertices), generator=torch.Generator().manual_seed(0))[:300]
     traced_mesh = Mesh(
@@ -187,7 +187,7 @@ def test_transfer_is_the_light_that_a_path_tracer_finds():
         bounces=2,
     )
     error = ours[some] - truth
-    hollow = found.direct[some, 0] < 0.7 * 0.282095
+    hollow = direct[some, 0] < 0.7 * 0.282095
     assert hollow.sum() > 20
     # 256 rays, 512 samples, and the little gloss of a surface whose F0 is 0; without what the
     # hollow's walls send, it would be off by a sixth
@@ -204,12 +204,12 @@ def test_a_ball_alone_sees_all_the_sky():
     flip = (outside * corner[:, 0]).sum(1) < 0
     faces[flip] = faces[flip].flip(1)
     mesh = mesh_of(points, faces, (0.5, 0.5, 0.5))
-    found = transfer(mesh, 1e-3)
+    direct, bounced = transfer(mesh, 1e-3)
     of_degree = [1.0] + 3 * [2 / 3] + 5 * [1 / 4] + 7 * [0.0] + 9 * [-1 / 24]
     expected = real_harmonics(4, mesh.normals) * torch.tensor(of_degree)
     # 256 rays; neighbours' faces rise above the tangent plane of none
-    torch.testing.assert_close(found.direct, expected, atol=0.01, rtol=0)
-    assert found.bounced.abs().max() == 0
+    torch.testing.assert_close(direct, expected, atol=0.01, rtol=0)
+    assert bounced.abs().max() == 0
 
 
 def test_vertices_take_the_texel_they_lie_in():

@@ -133,7 +133,7 @@ def test_chores_go_on_beside_pictures(studio, subject, light):
     studio.do(watcher.viewer, "c", chore("c", 1))
     held.set()
     watcher.wait(lambda: seen[-1] == ("c", 0))
-    watcher.wait(lambda: not watcher.viewer.chores)
+    watcher.wait(lambda: "c" not in watcher.viewer.chores)
 
 
 def test_a_chore_that_fails_is_one_line(studio, subject, light, caplog):

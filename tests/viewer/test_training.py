@@ -49,7 +49,7 @@ def looking(monkeypatch):
     clients = {0: Client(broken=True), 1: Client()}
     monkeypatch.setattr(module, "EVERY", 0.0)
     monkeypatch.setattr(module, "SHARE", 1e9)
-    monkeypatch.setattr(Spectators, "_clients", lambda self: clients)
+    monkeypatch.setattr("viser.ViserServer.get_clients", lambda self: clients)
     return clients[1]
 
 
@@ -109,7 +109,7 @@ def test_pictures_are_rare_where_they_are_slow(monkeypatch):
                 return np.zeros((4, 4, 3), np.uint8)
 
             spectators._picture = slow
-            spectators._clients = lambda: {0: Client()}
+            spectators._server = SimpleNamespace(get_clients=lambda: {0: Client()})
             spectators._photos = object()
             for _ in range(3000):
                 spectators.look(None, SimpleNamespace(finished=False))

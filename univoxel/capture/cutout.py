@@ -367,23 +367,20 @@ def _judged(
 
 def _told(splits: dict[str, Photos], verdicts: dict[str, list[Verdict]], usual: float) -> str:
     """How many masks agree with the object's silhouettes, and what is wrong with the others."""
-    faults: dict[str, list[str]] = {BESIDE: [], MISSING: []}
-    count = 0
-    for name, split in splits.items():
-        count += len(split)
-        for stem, verdict in zip(split.names, verdicts[name], strict=True):
-            if verdict.fault:
-                faults[verdict.fault].append(stem)
-    wrong = sum(map(len, faults.values()))
-    told = f"masks: {count - wrong} of {count} agree with the object's silhouette (IoU {usual:.2f})"
-    if not wrong:
-        return told
-    parts = []
+    faults = [
+        (stem, verdict.fault)
+        for name, split in splits.items()
+        for stem, verdict in zip(split.names, verdicts[name], strict=True)
+    ]
     said = {BESIDE: "include more than the object", MISSING: "miss part of the object"}
-    for fault, words in said.items():
-        if stems := faults[fault]:
-            parts.append(f"{len(stems)} {words} ({some(stems)})")
-    return f"{told}; {wrong} do not: {', '.join(parts)}"
+    parts = [
+        f"{len(stems)} {words} ({some(stems)})"
+        for fault, words in said.items()
+        if (stems := [stem for stem, found in faults if found == fault])
+    ]
+    count, wrong = len(faults), sum(bool(fault) for _, fault in faults)
+    told = f"masks: {count - wrong} of {count} agree with the object's silhouette (IoU {usual:.2f})"
+    return f"{told}; {wrong} do not: {', '.join(parts)}" if wrong else told
 
 
 def _write(

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -35,45 +36,40 @@ class Pair:
     kind: int  # configuration
 
 
-def _opened(path: Path) -> closing[sqlite3.Connection]:
-    return closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True))
+def _rows(path: Path, query: str, *values: int) -> Iterator[tuple[Any, ...]]:
+    with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as db:
+        yield from db.execute(query, values)
 
 
 def count(path: Path, table: str) -> int:
     """Rows of a table, 0 as long as it is not there."""
-    if not path.is_file():
-        return 0
     try:
-        with _opened(path) as db:
-            return int(db.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
+        return sum(n for (n,) in _rows(path, f"SELECT COUNT(*) FROM {table}"))
     except sqlite3.OperationalError:  # not made yet, or locked
         return 0
 
 
 def images(path: Path) -> dict[str, tuple[int, int]]:
-    """Id and camera of each picture, by name."""
-    if not path.is_file():
+    """Id and camera of each picture, by name; none as long as they are not there."""
+    try:
+        rows = list(_rows(path, "SELECT name, image_id, camera_id FROM images"))
+    except sqlite3.OperationalError:
         return {}
-    with _opened(path) as db:
-        try:
-            rows = db.execute("SELECT name, image_id, camera_id FROM images").fetchall()
-        except sqlite3.OperationalError:
-            return {}
     return {name: (number, camera) for name, number, camera in rows}
 
 
 def feature_counts(path: Path) -> dict[int, int]:
     """Number of features by image id."""
-    with _opened(path) as db:
-        return dict(db.execute("SELECT image_id, rows FROM keypoints").fetchall())
+    return dict(_rows(path, "SELECT image_id, rows FROM keypoints"))
 
 
 def largest_features(path: Path, image: int, most: int) -> np.ndarray:
     """Unit descriptors [N, D] float32 of the features of largest scale."""
     query = "SELECT rows, cols, data FROM {} WHERE image_id = ?"
-    with _opened(path) as db:
-        points = db.execute(query.format("keypoints"), (image,)).fetchone()
-        described = db.execute(query.format("descriptors"), (image,)).fetchone()
+    points, described = (
+        next(_rows(path, query.format(table), image), None)
+        for table in ("keypoints", "descriptors")
+    )
     if not points or not described or not points[0]:
         return np.zeros((0, 128), np.float32)
     points = np.frombuffer(points[2], np.float32).reshape(points[:2])
@@ -87,28 +83,25 @@ def largest_features(path: Path, image: int, most: int) -> np.ndarray:
 
 def verified_pairs(path: Path) -> list[tuple[int, int, int, int]]:
     """Image ids, inliers and configuration of each pair that was verified."""
-    with _opened(path) as db:
-        rows = db.execute("SELECT pair_id, rows, config FROM two_view_geometries").fetchall()
+    rows = _rows(path, "SELECT pair_id, rows, config FROM two_view_geometries")
     return [(pair // MOST_IMAGES, pair % MOST_IMAGES, n, kind) for pair, n, kind in rows]
 
 
 def matches(path: Path) -> Iterator[Pair]:
     """Pairs that were verified, with their inliers."""
-    with _opened(path) as db:
-        for pair, rows, data, kind in db.execute(
-            "SELECT pair_id, rows, data, config FROM two_view_geometries WHERE rows > 0"
-        ):
-            found = np.frombuffer(data, np.uint32).reshape(rows, 2)
-            yield Pair(pair // MOST_IMAGES, pair % MOST_IMAGES, found, kind)
+    query = "SELECT pair_id, rows, data, config FROM two_view_geometries WHERE rows > 0"
+    for pair, rows, data, kind in _rows(path, query):
+        found = np.frombuffer(data, np.uint32).reshape(rows, 2)
+        yield Pair(pair // MOST_IMAGES, pair % MOST_IMAGES, found, kind)
 
 
 def positions(path: Path) -> dict[int, np.ndarray]:
     """Where features are [F, 2], pixels, by image id."""
-    with _opened(path) as db:
-        rows = db.execute("SELECT image_id, rows, cols, data FROM keypoints").fetchall()
     return {
         number: np.frombuffer(data or b"", np.float32).reshape(count, width)[:, :2].astype(float)
-        for number, count, width, data in rows
+        for number, count, width, data in _rows(
+            path, "SELECT image_id, rows, cols, data FROM keypoints"
+        )
     }
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import shutil
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -47,15 +47,6 @@ CONSTANTS_0_2: dict[str, Any] = {
     **{"base_seconds": 120.0, "photograph_seconds": 30.0},
 }
 NAMED = 5  # photographs that a message names at most
-
-
-@dataclass(frozen=True)
-class Found:
-    """What structure from motion says, and what is believed of it."""
-
-    model: Model  # the largest, as it is
-    weak: dict[int, str]  # ids of pictures whose poses are not trusted, and why
-    reports: list[scene.Report]  # of all photographs
 
 
 def poses(
@@ -113,10 +104,9 @@ def poses(
         TimeRemainingColumn(),
     ) as progress:
         unreadable = _search(capture, folders, config, settings, progress)
-        found = _judge(capture, folders, unreadable)
-        _say(capture, found, keep_weak)
-        left_out = set() if keep_weak else set(found.weak)
-        model = without(found.model, left_out) if left_out else found.model
+        model, weak, reports = _judge(capture, folders, unreadable)
+        _say(capture, model, weak, reports, keep_weak)
+        model = without(model, set(weak)) if weak and not keep_weak else model
         index = {name: i for i, name in enumerate(capture.pictures)}
         ordered = sorted(model.images, key=lambda i: index[i.name])
         wanted = [index[image.name] for image in ordered]
@@ -131,7 +121,6 @@ def poses(
         steps.forget(folders.work, SCENE)
         written = scene.write_scene(out, capture, model, wanted, keep_size)
         _follow(progress, "writing", written, len(wanted))
-    reports = list(found.reports)
     for i in wanted:
         reports[i] = replace(reports[i], written=scene.written_name(capture.photographs[i]))
     scene.write_report(out, {**settings, **used, "versions": _versions()}, model, reports)
@@ -271,8 +260,11 @@ def _follow(progress: Progress, name: str, parts: Iterable[int], total: int) -> 
     progress.update(task, completed=total)
 
 
-def _judge(capture: Capture, folders: Folders, unreadable: dict[int, str]) -> Found:
-    """The largest model, and what is known of each photograph."""
+def _judge(
+    capture: Capture, folders: Folders, unreadable: dict[int, str]
+) -> tuple[Model, dict[int, str], list[scene.Report]]:
+    """The largest model; ids of pictures whose poses are not trusted, and why; what is known of
+    each photograph."""
     models = database.read_models(folders.models)
     pairs = database.verified_pairs(folders.database)
     features = database.feature_counts(folders.database)
@@ -293,16 +285,13 @@ def _judge(capture: Capture, folders: Folders, unreadable: dict[int, str]) -> Fo
         number = numbers.get(name, (None, None))[0]
         partners = sum(n >= pose_validation.NEEDED for a, b, n, _ in pairs if number in (a, b))
         if number in placed:
-            points = placed[number].points
+            known = True, placed[number].points, errors[number]
             reason = weak.get(number, "")
-            reports.append(
-                scene.Report(photograph, True, points, errors[number], partners, reason=reason)
-            )
-            continue
-        reason = unreadable.get(index) or pose_validation.why_not(
-            number, features, pairs, elsewhere
-        )
-        reports.append(scene.Report(photograph, False, partners=partners, reason=reason))
+        else:
+            known = False, 0, 0.0
+            why_not = pose_validation.why_not(number, features, pairs, elsewhere)
+            reason = unreadable.get(index) or why_not
+        reports.append(scene.Report(photograph, *known, partners, reason=reason))
     if len(placed) < PLACED_SHARE * len(reports):
         missing = [f"{r.name} ({r.reason})" for r in reports if not r.placed]
         raise DataError(
@@ -310,12 +299,17 @@ def _judge(capture: Capture, folders: Folders, unreadable: dict[int, str]) -> Fo
             "photographs, with more overlap, and do not move the object. "
             f"Not registered: {_some(missing)}"
         )
-    return Found(models[0], weak, reports)
+    return models[0], weak, reports
 
 
-def _say(capture: Capture, found: Found, keep_weak: bool) -> None:
+def _say(
+    capture: Capture,
+    model: Model,
+    weak: dict[int, str],
+    reports: list[scene.Report],
+    keep_weak: bool,
+) -> None:
     """How many were placed, how well, and which not."""
-    model, reports = found.model, found.reports
     lenses = [model.cameras[c] for c in sorted({i.camera for i in model.images})]
     shares = [f"{lens.focal[0] / lens.width:.2f}" for lens in lenses[:NAMED]]
     cameras = "one camera" if len(lenses) == 1 else f"{len(lenses)} cameras"
@@ -328,16 +322,17 @@ def _say(capture: Capture, found: Found, keep_weak: bool) -> None:
     if missing:
         log.warning(f"not registered: {_some(missing)}")
     index = {name: i for i, name in enumerate(capture.pictures)}
-    weak = [
-        f"{capture.photographs[index[i.name]].path.name} ({found.weak[i.number]})"
+    doubtful = [
+        f"{capture.photographs[index[i.name]].path.name} ({weak[i.number]})"
         for i in model.images
-        if i.number in found.weak
+        if i.number in weak
     ]
-    if weak:
+    if doubtful:
         fate = "kept" if keep_weak else "left out (keep_weak keeps them)"
         log.warning(
-            f"{len(weak)} photographs may have poses that are wrong by several degrees. They are "
-            f"{fate}: {_some(weak)}. Photograph the side that they show again, with more overlap",
+            f"{len(doubtful)} photographs may have poses that are wrong by several degrees. They "
+            f"are {fate}: {_some(doubtful)}. Photograph the side that they show again, with more "
+            "overlap",
             extra={"arguments": ("keep_weak",)},
         )
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import shutil
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -146,16 +145,14 @@ def place(capture: Capture, folders: Folders, config: CaptureConfig) -> Iterator
 
 
 def _request(step, capture: Capture, folders: Folders, config: CaptureConfig, **more) -> Request:
-    def absolute(path: Path) -> str:
-        return str(path.absolute())
-
+    folders = Folders(folders.work.absolute())
     return Request(
         step=step,
-        database=absolute(folders.database),
-        pictures=absolute(folders.pictures),
-        models=absolute(folders.models),
-        pairs=absolute(folders.pairs),
-        masks=absolute(folders.masks) if capture.masks is not None else "",
+        database=str(folders.database),
+        pictures=str(folders.pictures),
+        models=str(folders.models),
+        pairs=str(folders.pairs),
+        masks=str(folders.masks) if capture.masks is not None else "",
         features=config.features,
         first_octave=config.first_octave,
         seed=config.seed,

@@ -86,21 +86,19 @@ def command(asked: CaptureOptions) -> int:
     from univoxel.run import load_verdict
 
     check_minutes(asked.minutes)
-    where, until = (asked.photographs, asked.out), asked.until
-    masks = {name: getattr(asked, name) for name in ("masks", "network", "box", "keep_table")}
-    training = {name: getattr(asked, name) for name in ("preset", "light", "minutes")}
-    if until == "page":
-        made = capture(*where, **masks, **training, changes=asked.changes)
+    if asked.until == "page":
+        made = capture(**vars(asked))
         if verdict := load_verdict(made.run):
             log.info("\n".join(verdict.lines()))
         print(made.page)
         print(made.mesh)
         return code_of(made.run)
-    if (*training.values(), asked.changes) != ("auto", "hybrid", None, ()):
+    if (asked.preset, asked.light, asked.minutes, asked.changes) != ("auto", "hybrid", None, ()):
         raise UserError(
-            f"--until {until} does not train: leave out --preset, --light, --minutes and --set"
+            f"--until {asked.until} does not train: leave out --preset, --light, --minutes and "
+            "--set"
         )
-    print(find_data(*where, **masks, until=until))
+    print(find_data(**vars(asked)))
     return 0
 
 

@@ -9,6 +9,7 @@ from typing import Annotated
 
 from univoxel.cli.parsing import ADVANCED, File, Run, takes, written
 from univoxel.core import choices
+from univoxel.core.files import write_bytes
 from univoxel.errors import UserError
 
 SUFFIXES = (".glb", ".obj", ".ply", ".usdz")
@@ -107,7 +108,7 @@ def export(asked: ExportOptions) -> list[Path]:
     """
     from univoxel.detail.texture import load_detail
     from univoxel.output.mesh import bake, placed, placement_of, with_materials
-    from univoxel.output.mesh_files import require_usd, write_glb, write_obj, write_ply, write_usdz
+    from univoxel.output.mesh_files import glb, require_usd, write_obj, write_ply, write_usdz
     from univoxel.output.surface import cameras_of, surface_of
     from univoxel.output.topology import close, simplify
     from univoxel.run import load_world
@@ -151,9 +152,10 @@ def export(asked: ExportOptions) -> list[Path]:
             size = max(widest >> level, TEXTURE_SIZES[0])
             near = None if detail is None else detail.near
             textured = placed(bake(scene, reduced, size, near), placement)
-            {".glb": write_glb, ".usdz": write_usdz, ".obj": write_obj}[suffix](
-                path, textured, asked.jpeg
-            )
+            if suffix == ".glb":
+                write_bytes(path, glb(textured, asked.jpeg))
+            else:
+                {".usdz": write_usdz, ".obj": write_obj}[suffix](path, textured, asked.jpeg)
         written.append(path)
     return written
 

@@ -38,14 +38,6 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#99
 
 
 @dataclass(frozen=True)
-class Part:
-    """What one part of the model takes up in its file."""
-
-    parameters: int  # learned numbers
-    bytes: int  # with those that say where they belong
-
-
-@dataclass(frozen=True)
 class InfoOptions:
     run: Run
     """folder of a trained run"""
@@ -147,39 +139,39 @@ def camera_check(scene: Scene, run: Path) -> dict[str, Any] | None:
     }
 
 
-def parts(run: Path) -> dict[str, Part]:
-    """What every part takes up in the file, the largest first."""
+def parts(run: Path) -> dict[str, dict[str, int]]:
+    """What every part takes up in the file, the largest first: parameters, which are learned, and
+    bytes, with those of the numbers that say where they belong."""
     from safetensors import safe_open
 
     from univoxel.scene import FILE
 
-    found: dict[str, Part] = {}
+    found: dict[str, dict[str, int]] = {}
     with safe_open(run / FILE, "pt") as file:
         for name in file.keys():
             tensor = file.get_tensor(name)
-            part = next((p for start, p in PARTS.items() if name.startswith(start)), "other")
-            so_far = found.get(part, Part(0, 0))
-            learned = 0 if name in INDICES else tensor.numel()
-            size = tensor.numel() * tensor.element_size()
-            found[part] = Part(so_far.parameters + learned, so_far.bytes + size)
-    return dict(sorted(found.items(), key=lambda item: -item[1].bytes))
+            which = next((p for start, p in PARTS.items() if name.startswith(start)), "other")
+            part = found.setdefault(which, {"parameters": 0, "bytes": 0})
+            part["parameters"] += 0 if name in INDICES else tensor.numel()
+            part["bytes"] += tensor.numel() * tensor.element_size()
+    return dict(sorted(found.items(), key=lambda item: -item[1]["bytes"]))
 
 
-def facts(scene: Scene, parts: dict[str, Part], state: dict[str, Any]) -> dict[str, Any]:
+def facts(scene: Scene, parts: dict[str, dict[str, int]], state: dict[str, Any]) -> dict[str, Any]:
     """The numbers, see `info`."""
     from univoxel.lights import LocalSG
 
     grid, cfg = scene.field.grid, scene.cfg
     features = scene.field.occupied()
     return {
-        "parameters": sum(p.parameters for p in parts.values()),
-        "bytes": sum(p.bytes for p in parts.values()),
-        "parts": {name: vars(part) for name, part in parts.items()},
+        "parameters": sum(p["parameters"] for p in parts.values()),
+        "bytes": sum(p["bytes"] for p in parts.values()),
+        "parts": parts,
         "grid": {
             "size": list(grid.size),
             "voxel_size": grid.voxel_size,
             "nodes": grid.nodes_count,
-            "share_with_distance": parts["distances"].parameters / grid.nodes_count,
+            "share_with_distance": parts["distances"]["parameters"] / grid.nodes_count,
             "share_with_features": features.float().mean().item(),
         },
         "channels": cfg.channels,

@@ -253,11 +253,11 @@ def announce(progress: Progress, photos: Photos) -> None:
     size = photos.downscale**2 * pixels / len(photos)
     what = f"{len(photos)} photographs of {size:.2g} megapixels"
     clock.preparation = min(before, config.PREPARATION * clock.limit)
+    said = f"{what}: training takes about {duration(whole)} on this machine"
     if steps <= clock.limit:
-        log.info(f"{what}: training takes about {duration(whole)} on this machine")
+        log.info(said)
         return
     fits = max(clock.limit - clock.preparation - RESERVE_SECONDS, 0.0) / clock.planned
-    said = f"{what}: training takes about {duration(whole)} on this machine"
     said += f"; minutes={cfg.minutes:g} allows "
     if fits < 1:
         said += f"about {fits:.0%} of the steps"
@@ -319,7 +319,11 @@ def make_stage_(
     """
     stage, photos = cfg.stages[index], pixels.photos
     if isinstance(stage, config.StageConfig):
-        bring_to_grid_(scene, stage, box, progress)
+        grid = fit_grid(*box, compression.stage_voxels(stage, progress.chosen))
+        if stage.field == "sparse" and scene.field.kind != "sparse":
+            scene.field = scene.field.in_bricks(grid)
+        elif scene.field.grid != grid:
+            scene.field = scene.field.resized(grid)
     if pinned is not None:
         pinned.pin_(scene.field)
     if isinstance(stage, config.JointConfig):
@@ -336,20 +340,6 @@ def make_stage_(
     reach, state = chosen_reach(progress.chosen), progress.state()
     save_scene(scene, cfg.out, state, slim=last, reach=reach)
     preview(scene, scene.registered(photos), cfg.out / "preview.png")
-
-
-def bring_to_grid_(
-    scene: Scene,
-    stage: config.StageConfig,
-    box: tuple[torch.Tensor, torch.Tensor],
-    progress: Progress,
-) -> None:
-    """Bring the scene's field to the grid of a stage."""
-    grid = fit_grid(*box, compression.stage_voxels(stage, progress.chosen))
-    if stage.field == "sparse" and scene.field.kind != "sparse":
-        scene.field = scene.field.in_bricks(grid)
-    elif scene.field.grid != grid:
-        scene.field = scene.field.resized(grid)
 
 
 def trusted(scene: Scene, photos: Photos) -> Survey | None:

@@ -263,7 +263,9 @@ def bake(
         place, at = nearest_surface(scene.field, point, known)
         relief = in_frame(at.gradient, n, t)
         if seen is not None:
-            relief = _fading(relief, (w * seen[corner]).sum(1))
+            share, flat = (w * seen[corner]).sum(1)[:, None], torch.tensor([0.0, 0.0, 1.0])
+            faded = _unit(torch.lerp(flat.expand_as(relief), relief, share))
+            relief = torch.where(share < 1, faded, relief)
         albedo, *others = scene.material(at.features)
         if albedo_near is not None:
             albedo = albedo_near(place, _unit(at.gradient), albedo, footprint)
@@ -272,13 +274,6 @@ def bake(
     *rest, metallic = (torch.cat(p)[place] for p in zip(*parts, strict=True))
     metal = metal_or_none(metallic)
     return TexturedMesh(vertices, faces, normals, tangents, uv, *rest, metallic=metal, seen=seen)
-
-
-def _fading(relief: Tensor, seen: Tensor) -> Tensor:
-    """Normals [M, 3] in the tangent frame, flat where seen [M] is 0."""
-    flat = torch.tensor([0.0, 0.0, 1.0])
-    faded = _unit(torch.lerp(flat.expand_as(relief), relief, seen[:, None]))
-    return torch.where(seen[:, None] < 1, faded, relief)
 
 
 def in_frame(direction: Tensor, normal: Tensor, tangent: Tensor) -> Tensor:

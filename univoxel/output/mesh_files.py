@@ -23,18 +23,6 @@ from univoxel.errors import MissingExtra, UserError
 from univoxel.output.mesh import Y_UP, TexturedMesh, encoded, texture_pictures
 
 
-def write_glb(path: Path, mesh: TexturedMesh, jpeg: int | None = None) -> None:
-    """Write a textured mesh as GLB, turned to +Y up, whole or not at all.
-
-    Args:
-        jpeg: as in `glb`.
-
-    Raises:
-        OSError: the file cannot be written; nothing is left behind.
-    """
-    write_bytes(path, glb(mesh, jpeg))
-
-
 def glb(
     mesh: TexturedMesh, jpeg: int | None = None, extra: Mapping[str, Tensor] | None = None
 ) -> bytes:
@@ -190,19 +178,25 @@ def write_usdz(path: Path, mesh: TexturedMesh, jpeg: int | None = None) -> None:
         folder = Path(name)
         pictures = _write_pictures(folder, mesh, jpeg)
         layer = folder / "object.usdc"
-        _write_stage(usd, layer, mesh, pictures)
-        package = folder / "object.usdz"
-        _write_package(usd, package, [layer, *(folder / file for file in pictures.values())])
+        stage = usd.Usd.Stage.CreateNew(str(layer))
+        usd.UsdGeom.SetStageUpAxis(stage, usd.UsdGeom.Tokens.y)
+        usd.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        stage.GetRootLayer().documentation = f"univoxel {__version__}"
+        root = usd.UsdGeom.Xform.Define(stage, ROOT)
+        stage.SetDefaultPrim(root.GetPrim())
+        usd.Usd.ModelAPI(root.GetPrim()).SetKind("component")
+        _define_material(usd, stage, pictures)
+        _define_mesh(usd, stage, mesh)
+        stage.GetRootLayer().Save()
+        # The layer first, aligned and not compressed, as the format asks for
+        package, module = folder / "object.usdz", usd.Sdf
+        if not hasattr(module, "ZipFileWriter"):
+            module = usd.Usd
+        writer = module.ZipFileWriter.CreateNew(str(package))
+        for file in (layer.name, *pictures.values()):
+            writer.AddFile(str(folder / file), file)
+        writer.Save()
         write_bytes(path, package.read_bytes())
-
-
-def _write_package(usd: Any, package: Path, files: list[Path]) -> None:
-    """An archive of files, the layer first, aligned and not compressed as the format asks for."""
-    kind: Any = getattr(usd.Sdf, "ZipFileWriter", None) or getattr(usd.Usd, "ZipFileWriter", None)
-    writer = kind.CreateNew(str(package))
-    for file in files:
-        writer.AddFile(str(file), file.relative_to(package.parent).as_posix())
-    writer.Save()
 
 
 def _write_pictures(folder: Path, mesh: TexturedMesh, jpeg: int | None) -> dict[str, str]:
@@ -214,19 +208,6 @@ def _write_pictures(folder: Path, mesh: TexturedMesh, jpeg: int | None) -> dict[
         files[kind] = f"textures/{kind}.{'png' if jpeg is None else 'jpg'}"
         (folder / files[kind]).write_bytes(encoded(picture, jpeg))
     return files
-
-
-def _write_stage(usd: Any, layer: Path, mesh: TexturedMesh, pictures: dict[str, str]) -> None:
-    stage = usd.Usd.Stage.CreateNew(str(layer))
-    usd.UsdGeom.SetStageUpAxis(stage, usd.UsdGeom.Tokens.y)
-    usd.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    stage.GetRootLayer().documentation = f"univoxel {__version__}"
-    root = usd.UsdGeom.Xform.Define(stage, ROOT)
-    stage.SetDefaultPrim(root.GetPrim())
-    usd.Usd.ModelAPI(root.GetPrim()).SetKind("component")
-    _define_material(usd, stage, pictures)
-    _define_mesh(usd, stage, mesh)
-    stage.GetRootLayer().Save()
 
 
 def _define_mesh(usd: Any, stage: Any, mesh: TexturedMesh) -> None:

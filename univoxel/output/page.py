@@ -45,16 +45,11 @@ BOUNCES = 2  # reflections that are followed, as `univoxel relight` does
 VERTICES_AT_ONCE = 1024  # bounds memory
 
 
-@dataclass(frozen=True)
-class Transfer:
-    """Irradiance over pi of a vertex is the sum over harmonics of these times the map's numbers."""
+def transfer(mesh: TexturedMesh, offset: float) -> tuple[Tensor, Tensor]:
+    """Traced from each vertex of a mesh, with its albedo: direct [P, 25], and bounced [P, 3, 4] by
+    colour.
 
-    direct: Tensor  # [P, 25] float32
-    bounced: Tensor  # [P, 3, 4] float32, by colour
-
-
-def transfer(mesh: TexturedMesh, offset: float) -> Transfer:
-    """Traced from each vertex of a mesh, with its albedo.
+    Irradiance over pi of a vertex is the sum over harmonics of these times the map's numbers.
 
     Args:
         offset: from the surface, where rays start; world units.
@@ -75,7 +70,7 @@ def transfer(mesh: TexturedMesh, offset: float) -> Transfer:
         sent = albedo[:, :, None] * (lit + bounced)
         met = torch.einsum("mk,mkcl->mcl", weight, sent[corner])
         bounced = torch.zeros_like(lit).index_add_(0, vertex, met / RAYS)
-    return Transfer(direct[of_vertex], bounced[of_vertex])
+    return direct[of_vertex], bounced[of_vertex]
 
 
 def vertex_albedo(mesh: TexturedMesh) -> Tensor:
@@ -323,14 +318,14 @@ def model(scene: Scene, options: PageOptions, cameras: Cameras | None) -> bytes:
     surface = simplify(surface_of(scene, cameras), options.faces)
     textured = bake(scene, surface, options.texture_size, options.albedo_near)
     mesh = replace(textured, seen=None)  # nothing reads it
-    return glb(mesh, JPEG_QUALITY, attributes(transfer(mesh, OFFSET * scene.field.voxel_size)))
+    return glb(mesh, JPEG_QUALITY, attributes(*transfer(mesh, OFFSET * scene.field.voxel_size)))
 
 
-def attributes(found: Transfer) -> dict[str, Tensor]:
-    """A transfer by fours, as names of the page's script: [P, 4] each."""
-    padded = torch.nn.functional.pad(found.direct, (0, -found.direct.shape[1] % 4))
+def attributes(direct: Tensor, bounced: Tensor) -> dict[str, Tensor]:
+    """What `transfer` gives, by fours, as names of the page's script: [P, 4] each."""
+    padded = torch.nn.functional.pad(direct, (0, -direct.shape[1] % 4))
     groups = {f"_DIRECT{i}": four for i, four in enumerate(padded.split(4, 1))}
-    colors = zip(("_RED", "_GREEN", "_BLUE"), found.bounced.unbind(1), strict=True)
+    colors = zip(("_RED", "_GREEN", "_BLUE"), bounced.unbind(1), strict=True)
     return {name: four.clamp(-1, 1) for name, four in (groups | dict(colors)).items()}
 
 

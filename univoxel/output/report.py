@@ -48,17 +48,6 @@ from univoxel.training.clock import ALL, Clock, stage_name
 from univoxel.training.progress import LOG
 
 
-@dataclass(frozen=True)
-class StageFacts:
-    """A stage of a training, for people."""
-
-    name: str
-    planned: int  # steps
-    made: float | None  # share of them; None: it has not ended
-    seconds: float | None  # None: not known
-    fate: str  # what ended it
-
-
 def curves(run: Path) -> list[Curve]:
     """Loss and validation PSNR over time; empty where the log cannot be read."""
     losses: list[list[tuple[float, float]]] = []
@@ -87,8 +76,9 @@ def curves(run: Path) -> list[Curve]:
     return [curve for curve in found if any(curve.pieces)]
 
 
-def stages(cfg: TrainConfig, state: dict[str, Any]) -> list[StageFacts]:
-    """The stages of a training, in order."""
+def stages(cfg: TrainConfig, state: dict[str, Any]) -> list[tuple[str, ...]]:
+    """The stages of a training, in order: name, planned steps, share of them that was made, time,
+    and what ended it; what is not known is empty."""
     made, early, took = (list(state.get(key, ())) for key in ("made", "early", "took"))
     found = []
     for k, stage in enumerate(cfg.stages):
@@ -101,8 +91,10 @@ def stages(cfg: TrainConfig, state: dict[str, Any]) -> list[StageFacts]:
             fate = "stopped early" if state.get("finished") else "shortened by the time limit"
         else:
             fate = "whole"
-        seconds = took[k] if k < len(took) else None
-        found.append(StageFacts(stage_name(cfg.stages, k), stage.iterations, share, seconds, fate))
+        completed = "" if share is None else f"{share:.0%}"
+        seconds = f"{took[k]:.1f} s" if k < len(took) else ""
+        name = f"{k + 1}: {stage_name(cfg.stages, k)}"
+        found.append((name, f"{stage.iterations:,}", completed, seconds, fate))
     return found
 
 
@@ -350,13 +342,14 @@ def light_section(scene: Scene, mesh: Mesh) -> str:
     if found is None:
         kind = scene.cfg.light.kind
         return paragraph(f"There is no environment map: the run was trained with {kind} light.")
+    radiance, about = found
     names = ("map", "diffuse sphere", "chrome sphere")
-    tiles = zip(names, report_pictures.pictures_of(found), strict=True)
+    tiles = zip(names, report_pictures.pictures_of(radiance), strict=True)
     legend = (
         "Spheres are seen from +X, with +Z up. The brightness of each channel is unknown, "
         "because a bright light and a bright albedo look the same in photographs."
     )
-    return paragraph(found.about) + gallery(tiles, legend, "light")
+    return paragraph(about) + gallery(tiles, legend, "light")
 
 
 def training_section(run: Path, state: dict[str, Any]) -> str:
@@ -379,10 +372,7 @@ def training_section(run: Path, state: dict[str, Any]) -> str:
     rows = []
     if (before := prepared(state)) is not None:
         rows.append(("preparation", "", "", f"{before:.1f} s", ""))
-    for k, fact in enumerate(stages(cfg, state)):
-        made = "" if fact.made is None else f"{fact.made:.0%}"
-        took = "" if fact.seconds is None else f"{fact.seconds:.1f} s"
-        rows.append((f"{k + 1}: {fact.name}", f"{fact.planned:,}", made, took, fact.fate))
+    rows += stages(cfg, state)
     parts.append(table(rows, ("stage", "planned steps", "completed", "time", "")))
     limit = "" if cfg.minutes is None else f"The time limit was {60 * cfg.minutes:,.0f} s."
     told = [limit, *remarks(cfg, state)]

@@ -197,17 +197,10 @@ POINTS = 512  # of the surface, that a local light is asked at
 AT_ONCE = 64  # of them
 
 
-@dataclass(frozen=True)
-class FoundLight:
-    """A map of light, and where it comes from."""
-
-    radiance: Tensor  # [H, 2 H, 3] linear
-    about: str  # for people
-
-
 @torch.no_grad()
-def found_light(scene: Scene, mesh: Mesh) -> FoundLight | None:
-    """The scene's environment map; of a local light its mean over the surface; None: neither.
+def found_light(scene: Scene, mesh: Mesh) -> tuple[Tensor, str] | None:
+    """The scene's environment map [H, 2 H, 3]; of a local light its mean over the surface; and a
+    word for people on where it comes from. None: neither.
 
     What a local light says of a direction is meant for points that face it: there it was learned.
     """
@@ -216,7 +209,7 @@ def found_light(scene: Scene, mesh: Mesh) -> FoundLight | None:
         about = "The recovered environment map."
         if scene.flash is not None:
             about += " A flash on the camera also lit the object."
-        return FoundLight(scene.exposed(sky.latlong(ROWS)), about)
+        return scene.exposed(sky.latlong(ROWS)), about
     if not isinstance(scene.light, AbstractLocalLight):
         return None
     about = (
@@ -226,7 +219,7 @@ def found_light(scene: Scene, mesh: Mesh) -> FoundLight | None:
     )
     if scene.cfg.turntable is not None:
         about += " The map is fixed to the room around the turntable."
-    return FoundLight(local_map(scene, mesh), about)
+    return local_map(scene, mesh), about
 
 
 def local_map(scene: Scene, mesh: Mesh) -> Tensor:
@@ -250,10 +243,10 @@ def local_map(scene: Scene, mesh: Mesh) -> Tensor:
     return scene.exposed(total / weight).view(LOCAL_ROWS, 2 * LOCAL_ROWS, 3)
 
 
-def pictures_of(found: FoundLight) -> list[Tensor]:
+def pictures_of(radiance: Tensor) -> list[Tensor]:
     """Map, grey ball and mirror ball [ROWS, ..., 3], sRGB, as bright as shows most of the map."""
-    bright = luminance(found.radiance).quantile(0.9).clamp_min(1e-6)
-    return [linear_to_srgb(tile) for tile in map_and_balls(found.radiance / bright, ROWS)]
+    bright = luminance(radiance).quantile(0.9).clamp_min(1e-6)
+    return [linear_to_srgb(tile) for tile in map_and_balls(radiance / bright, ROWS)]
 
 
 # Drawings of a report, as SVG in the text of a page.

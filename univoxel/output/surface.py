@@ -48,13 +48,10 @@ def surface_of(scene: Scene, cameras: Cameras | None = None) -> Mesh:
     Raises:
         ValueError: there is no surface, or no part of it encloses volume.
     """
-    mesh, dropped = cleaned(Mesh(*scene.field.isosurface(closed=True)))
-    if dropped.crumbs or dropped.voids:
-        log.info(
-            "mesh: left out %d small pieces beside the object and %d hollows inside it",
-            dropped.crumbs,
-            dropped.voids,
-        )
+    mesh, *dropped = cleaned(Mesh(*scene.field.isosurface(closed=True)))
+    if any(dropped):
+        said = "mesh: left out %d small pieces beside the object and %d hollows inside it"
+        log.info(said, *dropped)
     if cameras is None:
         return mesh
     low, high = scene.field.bounds()

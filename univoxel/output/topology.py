@@ -6,7 +6,7 @@ mesh carries at its vertices is dropped.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import fast_simplification
@@ -23,14 +23,6 @@ WELD = 1e-3  # of the mean edge: vertices closer than this become one
 CRUMB = 0.01  # of the largest component's area: smaller components are dropped
 
 
-@dataclass(frozen=True)
-class Dropped:
-    """How many components cleaning has left out."""
-
-    crumbs: int  # small ones beside the object
-    voids: int  # what bounds a hollow inside the object, and open ones without volume
-
-
 def clean(mesh: Mesh) -> Mesh:
     """Weld coincident vertices, drop degenerate and double faces, crumbs and inner voids.
 
@@ -43,18 +35,20 @@ def clean(mesh: Mesh) -> Mesh:
     return cleaned(mesh)[0]
 
 
-def cleaned(mesh: Mesh) -> tuple[Mesh, Dropped]:
-    """As `clean`, and what was dropped."""
+def cleaned(mesh: Mesh) -> tuple[Mesh, int, int]:
+    """As `clean`, and how many components were dropped: small ones beside the object; hollows
+    inside it, and open ones without volume."""
     vertices, faces = mesh.vertices.double().numpy(), mesh.faces.long().numpy()
-    dropped = Dropped(0, 0)
+    crumbs = voids = 0
     if len(faces):
         faces = _without_degenerate(_welded(vertices, faces))
-        faces, dropped = _component_faces(vertices, faces)
+    if len(faces):
+        faces, crumbs, voids = _component_faces(vertices, faces)
     if not len(faces):
         raise NoSurface("the surface has no part that encloses a volume")
     used, index = np.unique(faces, return_inverse=True)
     seen = None if mesh.seen is None else mesh.seen[torch.from_numpy(used)]
-    return _mesh(vertices[used], index.reshape(-1, 3), seen), dropped
+    return _mesh(vertices[used], index.reshape(-1, 3), seen), crumbs, voids
 
 
 def simplify(mesh: Mesh, faces: int) -> Mesh:
@@ -164,10 +158,8 @@ def _without_degenerate(faces: np.ndarray) -> np.ndarray:
     return faces[np.sort(first)]
 
 
-def _component_faces(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, Dropped]:
-    """Faces of the components that `clean` keeps."""
-    if not len(faces):
-        return faces, Dropped(0, 0)
+def _component_faces(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, int, int]:
+    """Faces of the components that `clean` keeps; how many it drops, as `cleaned` has them."""
     edges, size = _edges(faces), len(vertices)
     graph = coo_matrix((np.ones(len(edges), bool), edges.T), shape=(size, size))
     count, label = connected_components(graph, directed=False)
@@ -182,5 +174,5 @@ def _component_faces(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarra
     volume = np.bincount(label, (a * np.cross(b, c)).sum(1), count)
     small, hollow = area < CRUMB * area.max(), volume <= 0
     there = area > 0  # other numbers are of vertices without a face
-    dropped = Dropped(int((there & small & ~hollow).sum()), int((there & hollow).sum()))
-    return faces[~(small | hollow)[label]], dropped
+    crumbs, voids = int((there & small & ~hollow).sum()), int((there & hollow).sum())
+    return faces[~(small | hollow)[label]], crumbs, voids

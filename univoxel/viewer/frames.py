@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from importlib.util import find_spec
+from itertools import chain, repeat
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
@@ -32,37 +33,6 @@ _BESIDE = ThreadPoolExecutor(1, "univoxel denoiser")
 def available() -> bool:
     """Whether the extra `denoise` is installed."""
     return find_spec("pyoidn") is not None
-
-
-def denoised_beside(
-    rgb: Tensor, albedo: Tensor, normal: Tensor, shadow: Tensor | None
-) -> Future[tuple[Tensor, Tensor | None]]:
-    """`denoised` in a thread of its own, of the values as they are now."""
-    copies = (rgb.clone(), albedo.clone(), normal.clone())
-    return _BESIDE.submit(denoised, *copies, None if shadow is None else shadow.clone())
-
-
-def denoised(
-    rgb: Tensor, albedo: Tensor, normal: Tensor, shadow: Tensor | None
-) -> tuple[Tensor, Tensor | None]:
-    """Radiance without its noise, and a floor's shadow likewise.
-
-    Args:
-        rgb: [H, W, 3] linear.
-        albedo, normal: [H, W, 3], free of noise, 0 if there is no surface.
-        shadow: [H, W] in [0, 1].
-    """
-    import pyoidn  # pyright: ignore[reportMissingImports]  the extra `denoise`
-
-    def array(values: Tensor) -> np.ndarray:
-        return np.ascontiguousarray(values.numpy(), np.float32)
-
-    aside = {"albedo": array(albedo), "normal": array(normal)}
-    light = torch.from_numpy(pyoidn.denoise(array(rgb), **aside, hdr=True)).clamp_min(0)
-    if shadow is None:
-        return light, None
-    grey = pyoidn.denoise(array(shadow[..., None].expand(-1, -1, 3)))
-    return light, torch.from_numpy(grey)[..., 0].clamp(0, 1)
 
 
 Layer: TypeAlias = Literal[
@@ -163,28 +133,27 @@ def _passes(
     done, number = 0, 0
     while done < samples:
         more = min(PASSES[min(number, len(PASSES) - 1)], samples - done)
-
-        def traced(index: Tensor, done: int = done, more: int = more) -> Tensor:
-            return relight_surface(
-                at_rays(surface, index),
-                wo[index],
+        share = more / (done + more)
+        for some in _steps(hit, more):
+            found = relight_surface(
+                at_rays(surface, some),
+                wo[some],
                 subject.traced,
                 look.lighting,
                 samples=more,
                 bounces=BOUNCES,
                 first=done,
-                seed=int(index[0]),  # other noise than in other steps
+                seed=int(some[0]),  # other noise than in other steps
             )
-
-        def darkened(index: Tensor, more: int = more, number: int = number) -> Tensor:
-            some, hidden = _at(rays, index), torch.zeros(len(index), dtype=torch.bool)
-            seed = (int(index[0]) + 0x9E3779B9 * number) % 2**32
-            return _shadow(subject, look, some, hidden, more, BOUNCES, seed)
-
-        share = more / (done + more)
-        yield from _accumulated_(rgb, hit, traced, share, more)
+            rgb[some] += share * (found - rgb[some])
+            yield None
         if shadow is not None:
-            yield from _accumulated_(shadow, floor, darkened, share, 2 * more)
+            for some in _steps(floor, 2 * more):
+                hidden = torch.zeros(len(some), dtype=torch.bool)
+                seed = (int(some[0]) + 0x9E3779B9 * number) % 2**32
+                found = _shadow(subject, look, _at(rays, some), hidden, more, BOUNCES, seed)
+                shadow[some] += share * (found - shadow[some])
+                yield None
         done, number = done + more, number + 1
         yield rgb, shadow
 
@@ -199,51 +168,45 @@ def _denoised(
     running: Future[Light] | None = None
     waiting: Light | None = None
     clean = False
-    for found in passes:
-        if found is not None:
+    for found, over in chain(((light, False) for light in passes), repeat((None, True))):
+        if over:
+            if running is None:
+                return
+            wait([running], WAIT_SECONDS)
+        elif found is not None:
             waiting = found
             if not clean:
                 yield found
         if running is not None and running.done():
-            yield _flat(*running.result())
+            yield running.result()
             running, clean = None, True
         if running is None and waiting is not None:
-            running = denoised_beside(*_guided(cameras, surface, *waiting))
-            waiting = None
-        yield None
-    while running is not None:
-        wait([running], WAIT_SECONDS)
-        if running.done():
-            yield _flat(*running.result())
-            running = None
-        if running is None and waiting is not None:
-            running = denoised_beside(*_guided(cameras, surface, *waiting))
-            waiting = None
+            rgb, shadow = waiting  # which the next passes change
+            copies = rgb.clone(), None if shadow is None else shadow.clone()
+            running, waiting = _BESIDE.submit(_without_noise, cameras, surface, *copies), None
         yield None
 
 
-def _guided(
-    cameras: Cameras, surface: Surface, rgb: Tensor, shadow: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """What a denoiser takes: pictures of light, albedo and normals; and of the shadow."""
+def _without_noise(cameras: Cameras, surface: Surface, rgb: Tensor, shadow: Tensor | None) -> Light:
+    """The light of pixels, linear, and a floor's shadow, guided by albedo and normals."""
+    import pyoidn  # pyright: ignore[reportMissingImports]  the extra `denoise`
+
+    def array(values: Tensor) -> np.ndarray:
+        return np.ascontiguousarray(_grid(cameras, values).numpy(), np.float32)
+
     hit = surface.opacity[:, None] > 0
-    parts = [rgb, torch.where(hit, surface.albedo, 0), torch.where(hit, surface.normal, 0)]
-    light, albedo, normal = (_grid(cameras, part) for part in parts)
-    return light, albedo, normal, None if shadow is None else _grid(cameras, shadow)[..., 0]
+    guides = {"albedo": surface.albedo, "normal": surface.normal}
+    aside = {name: array(torch.where(hit, values, 0)) for name, values in guides.items()}
+    light = torch.from_numpy(pyoidn.denoise(array(rgb), **aside, hdr=True)).clamp_min(0)
+    if shadow is None:
+        return light.reshape(-1, 3), None
+    grey = torch.from_numpy(pyoidn.denoise(array(shadow[:, None].expand(-1, 3))))
+    return light.reshape(-1, 3), grey[..., 0].clamp(0, 1).reshape(-1)
 
 
-def _flat(rgb: Tensor, shadow: Tensor | None) -> Light:
-    return rgb.reshape(-1, 3), None if shadow is None else shadow.reshape(-1)
-
-
-def _accumulated_(
-    mean: Tensor, index: Tensor, render: Callable[[Tensor], Tensor], share: float, samples: int
-) -> Iterator[None]:
-    """Take another pass into the mean of some pixels, in steps; None after each."""
-    for some in index.split(max(1, STEP_PATHS // samples)):
-        if len(some):
-            mean[some] += share * (render(some) - mean[some])
-        yield None
+def _steps(pixels: Tensor, samples: int) -> Iterable[Tensor]:
+    """Pixels in parts of a step each."""
+    return pixels.split(max(1, STEP_PATHS // samples)) if len(pixels) else ()
 
 
 def _at(rays: Rays, index: Tensor) -> Rays:
@@ -295,17 +258,13 @@ def _layer(subject: Subject, cameras: Cameras, layer: Layer, surface: Surface) -
             metal = metal_or_none(surface.metallic)
             metal = torch.zeros_like(surface.depth) if metal is None else metal
             values = metal[:, None].expand(-1, 3)
-        case _:
-            values = _nearness(subject, cameras, surface)[:, None].expand(-1, 3)
+        case _:  # depth along -Z: 1 at the object's nearest point, 0 at its farthest
+            place, back = cameras.camera_to_world[0, :, 3], cameras.camera_to_world[0, :, 2]
+            ends = -(subject.traced.mesh.vertices - place) @ back
+            depth = -(surface.position - place) @ back
+            nearness = 1 - (depth - ends.min()) / (ends.max() - ends.min()).clamp_min(1e-9)
+            values = nearness[:, None].expand(-1, 3)
     return _grid(cameras, torch.cat([values.clamp(0, 1), surface.opacity[:, None]], 1))
-
-
-def _nearness(subject: Subject, cameras: Cameras, surface: Surface) -> Tensor:
-    """Depth along -Z [N] as brightness: 1 at the object's nearest point, 0 at its farthest."""
-    pose = cameras.camera_to_world[0]
-    ends = -(subject.traced.mesh.vertices - pose[:, 3]) @ pose[:, 2]
-    depth = -(surface.position - pose[:, 3]) @ pose[:, 2]
-    return 1 - (depth - ends.min()) / (ends.max() - ends.min()).clamp_min(1e-9)
 
 
 def _grid(cameras: Cameras, values: Tensor) -> Tensor:

@@ -27,20 +27,19 @@ QUICK_WIDTHS = (64, 384)  # pixels, between which its width is chosen
 FIRST_WIDTH = 160  # pixels, before any was timed
 REST_WIDTH = 640  # most pixels along the width at rest
 REST_SECONDS = 0.25  # without a change, after which a view rests
+VIEW = "view"  # the chore that shows pictures
 DONE = object()  # what a chore yields no more
 
 
 @dataclass
 class Viewer:
-    """One client's view; changed by `Studio.ask` alone."""
+    """One client's view; changed by `Studio` alone."""
 
     show: Callable[[Tensor], None]  # takes a picture [H, W, 4], sRGB with straight alpha
     complain: Callable[[str], None]  # takes one line for people
     width: int = FIRST_WIDTH  # of quick pictures
-    wanted: tuple[Cameras, Look] | None = None
     changed: float = 0.0  # when it was last asked for something
     stale: bool = False  # whether a quick picture is due
-    refining: Iterator[Tensor | None] | None = None
     chores: dict[str, Iterator[None]] = field(default_factory=dict)  # by what they make
     gone: bool = False
 
@@ -71,9 +70,8 @@ class Studio:
     def ask(self, viewer: Viewer, cameras: Cameras, look: Look) -> None:
         """Show a viewer view 0 of cameras as large as its window, from now on."""
         with self._news:
-            viewer.wanted, viewer.stale = (cameras, look), True
-            viewer.refining, viewer.changed = None, time.monotonic()
-            self._news.notify()
+            viewer.stale, viewer.changed = True, time.monotonic()
+            self.do(viewer, VIEW, self._pictures(viewer, cameras, look))
 
     def do(self, viewer: Viewer, name: str, steps: Iterator[None]) -> None:
         """Run something for a viewer, step by step, where nobody's view moves.
@@ -100,87 +98,63 @@ class Studio:
             with self._news:
                 work = None
                 while not self._ended and (work := self._next(turn)) is None:
-                    waiting = any(v.wanted and v.refining is None for v in self._viewers)
-                    self._news.wait(REST_SECONDS / 4 if waiting else None)
+                    resting = any(VIEW in viewer.chores for viewer in self._viewers)
+                    self._news.wait(REST_SECONDS / 4 if resting else None)
                 if self._ended or work is None:
                     return
-                turn += 1
-                viewer, chore = work
-            try:
-                self._work(viewer, chore)
-            except (UserError, OSError) as error:
-                self._give_up(viewer, chore, str(error))
-            except Exception:
-                log.exception("rendering failed")  # a fault of the program: its traceback
-                self._give_up(viewer, chore, "rendering failed: see the terminal of univoxel")
+            turn += 1
+            self._work(*work)
 
-    def _next(self, turn: int) -> tuple[Viewer, str | None] | None:
-        """The viewer whose turn it is, and its chore, if not its view; None: all are served."""
+    def _next(self, turn: int) -> tuple[Viewer, str] | None:
+        """The viewer whose turn it is, and its chore; None: all are served."""
         for viewer in self._viewers:
             if viewer.stale:
-                return viewer, None
+                return viewer, VIEW
         rested = time.monotonic() - REST_SECONDS
-        able: list[tuple[Viewer, str | None]] = [
-            (v, None) for v in self._viewers if v.wanted and v.changed <= rested
+        able = [
+            (viewer, name)
+            for viewer in self._viewers
+            for name in viewer.chores
+            if name != VIEW or viewer.changed <= rested
         ]
-        able += [(v, name) for v in self._viewers for name in v.chores]
         return able[turn % len(able)] if able else None
 
-    def _work(self, viewer: Viewer, chore: str | None) -> None:
-        """One step."""
+    def _work(self, viewer: Viewer, name: str) -> None:
+        """One step of a chore."""
         with self._news:
-            steps = viewer.chores.pop(chore, None) if chore is not None else None
-            wanted, quick = viewer.wanted, viewer.stale
-            if chore is None:
+            steps = viewer.chores.get(name, iter(()))  # the viewer may have left
+            if name == VIEW:
                 viewer.stale = False
-        if chore is None:
-            if wanted is not None:
-                (self._quick if quick else self._refine)(viewer, *wanted)
-        elif steps is not None and next(steps, DONE) is not DONE:
-            with self._news:
-                if not viewer.gone:
-                    viewer.chores.setdefault(chore, steps)  # another of its name goes before it
+        line = None
+        try:
+            if next(steps, DONE) is not DONE:
+                return
+        except (UserError, OSError) as error:
+            line = str(error)
+        except Exception:
+            log.exception("rendering failed")  # a fault of the program: its traceback
+            line = "rendering failed: see the terminal of univoxel"
+        with self._news:
+            if viewer.chores.get(name) is steps:  # and not another that took its place
+                del viewer.chores[name]
+        if line is not None and not viewer.gone:
+            viewer.complain(line)
 
-    def _quick(self, viewer: Viewer, cameras: Cameras, look: Look) -> None:
+    def _pictures(self, viewer: Viewer, cameras: Cameras, look: Look) -> Iterator[None]:
+        """The chore VIEW: a quick picture, and where the view rests better and better ones."""
         begin = time.monotonic()
         picture = quick_picture(self._subject, resize(cameras, viewer.width), look)
-        self._show(viewer, picture)
+        if not viewer.gone:
+            viewer.show(picture)
         share = QUICK_SECONDS / max(time.monotonic() - begin, 1e-3)
         low, high = QUICK_WIDTHS
         viewer.width = round(min(max(viewer.width * min(max(share, 0.5), 1.2) ** 0.5, low), high))
-
-    def _refine(self, viewer: Viewer, cameras: Cameras, look: Look) -> None:
-        pictures = viewer.refining
-        if pictures is None:
-            at_rest = resize(cameras, min(cameras.width, REST_WIDTH))
-            pictures = refined_pictures(self._subject, at_rest, look)
-            with self._news:
-                if viewer.stale:
-                    return
-                viewer.refining = pictures
-        try:
-            picture = next(pictures)
-        except StopIteration:
-            with self._news:
-                if not viewer.stale:
-                    viewer.wanted = None
-            return
-        if picture is not None:
-            self._show(viewer, picture)
-
-    def _show(self, viewer: Viewer, picture: Tensor) -> None:
-        with self._news:
-            if viewer.gone or (viewer.stale and viewer.refining is not None):
-                return
-        viewer.show(picture)
-
-    def _give_up(self, viewer: Viewer, chore: str | None, line: str) -> None:
-        with self._news:
-            if chore is None:
-                viewer.wanted, viewer.refining = None, None
-            if viewer.gone:
-                return
-        viewer.complain(line)
+        yield
+        at_rest = resize(cameras, min(cameras.width, REST_WIDTH))
+        for picture in refined_pictures(self._subject, at_rest, look):
+            if picture is not None and not viewer.gone:
+                viewer.show(picture)
+            yield
 
 
 # A turn around the object as a moving picture, from where a camera stands.

@@ -6,7 +6,6 @@ viser draws the controls and moves the camera; the picture stands behind its emp
 from __future__ import annotations
 
 import contextlib
-import io
 import itertools
 import math
 import tempfile
@@ -18,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -29,7 +27,7 @@ from univoxel.core import log
 from univoxel.data import Photos
 from univoxel.errors import UserError
 from univoxel.ops import Sun
-from univoxel.output.mesh import bake
+from univoxel.output.mesh import bake, encoded
 from univoxel.output.mesh_files import glb
 from univoxel.output.page import FACES, JPEG_QUALITY, Light, PageOptions, light_of_file, lights_of
 from univoxel.output.topology import simplify
@@ -71,7 +69,10 @@ def serving(
     options = replace(options, title=title)
     with hosted(host, port, title) as server:
         lights = lights_of(subject.scene, options)
-        _start_camera(server, subject)
+        start = orbit(subject.traced.mesh, 8, 512).camera_to_world[1, :, 3]
+        server.initial_camera.position = start.numpy()
+        server.initial_camera.look_at = torch.stack(subject.bounds).mean(0).numpy()
+        server.initial_camera.fov = math.radians(VIEW_ANGLE)
         studio = Studio(subject)
         clients: dict[int, Viewer] = {}
 
@@ -339,9 +340,8 @@ class Panel:
     def _send_png(self) -> None:
         if self._last is None:
             return
-        held = io.BytesIO()
-        Image.fromarray(_bytes(self._last)).save(held, "png")
-        self._client.send_file_download(f"{self._title}.png", held.getvalue())
+        content = encoded(_bytes(self._last), None)
+        self._client.send_file_download(f"{self._title}.png", content)
 
     def _send_glb(self) -> None:
         surface = simplify(self._subject.traced.mesh, FACES)
@@ -374,8 +374,7 @@ def light_of_bytes(name: str, content: bytes) -> Light:
 
 def camera_of(wxyz: Any, position: Any, angle: float, width: int, height: int) -> Cameras:
     """viser's camera (+X right, +Y down, +Z ahead; vertical angle in radians) as one of ours."""
-    w, x, y, z = (float(v) for v in wxyz)
-    turn = torch.from_numpy(Rotation.from_quat([x, y, z, w]).as_matrix()).float()
+    turn = torch.from_numpy(Rotation.from_quat(wxyz, scalar_first=True).as_matrix()).float()
     turn = turn * torch.tensor([1.0, -1.0, -1.0])
     place = torch.tensor([float(v) for v in position])
     focal = height / 2 / math.tan(angle / 2)
@@ -388,10 +387,10 @@ def pose_for_viser(cameras: Cameras, view: int) -> tuple[np.ndarray, np.ndarray,
     """wxyz, position, vertical angle in radians and aspect of a view, as viser takes them."""
     pose = cameras.camera_to_world[view]
     turn = (pose[:, :3] * torch.tensor([1.0, -1.0, -1.0])).double().numpy()
-    x, y, z, w = Rotation.from_matrix(turn).as_quat()
+    wxyz = Rotation.from_matrix(turn).as_quat(scalar_first=True)
     width, height = cameras.size(view)
     angle = 2 * math.atan(height / 2 / float(cameras.focal[view, 1]))
-    return np.array([w, x, y, z]), pose[:, 3].numpy(), angle, width / height
+    return wxyz, pose[:, 3].numpy(), angle, width / height
 
 
 def laid_over(rgb: Tensor, photos: Photos, view: int, cameras: Cameras, share: float) -> Tensor:
@@ -414,11 +413,3 @@ def laid_over(rgb: Tensor, photos: Photos, view: int, cameras: Cameras, share: f
     over = share * alpha[:, None]
     flat[where] = (1 - over) * flat[where] + over * linear_to_srgb(color)
     return flat.reshape(rgb.shape)
-
-
-def _start_camera(server: Any, subject: Subject) -> None:
-    cameras = orbit(subject.traced.mesh, 8, 512)
-    pose = cameras.camera_to_world[1]
-    server.initial_camera.position = pose[:, 3].numpy()
-    server.initial_camera.look_at = torch.stack(subject.bounds).mean(0).numpy()
-    server.initial_camera.fov = math.radians(VIEW_ANGLE)

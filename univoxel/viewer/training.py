@@ -192,7 +192,7 @@ class Spectators:
             return
         begin = time.monotonic()
         with self._guarded():
-            clients = self._clients()
+            clients = self._server.get_clients()
             if clients and self._photos is not None:
                 self._send(clients, self._picture(scene, clock, self._photos))
         end = time.monotonic()
@@ -238,9 +238,6 @@ class Spectators:
             except Exception as error:  # gone in between, or broken: its own affair
                 log.debug("a browser could not be reached: %s", error)
 
-    def _clients(self) -> Mapping[int, Any]:
-        return self._server.get_clients()
-
     def _hasten(self) -> None:
         """Let the next picture come soon, since another is chosen; not sooner than SHARE allows."""
         self._next = min(self._next, time.monotonic() + 0.5)
@@ -272,7 +269,6 @@ def fitted(picture: np.ndarray, aspect: float) -> np.ndarray:
     if not 0.05 < aspect < 20:  # no window yet
         return picture
     high, wide = max(height, round(width / aspect)), max(width, round(height * aspect))
-    whole = np.full((high, wide, 3), BEHIND, np.uint8)
     top, left = (high - height) // 2, (wide - width) // 2
-    whole[top : top + height, left : left + width] = picture
-    return whole
+    around = ((top, high - height - top), (left, wide - width - left), (0, 0))
+    return np.pad(picture, around, constant_values=BEHIND)
