@@ -152,7 +152,7 @@ class Studio:
         yield
         at_rest = resize(cameras, min(cameras.width, REST_WIDTH))
         for picture in refined_pictures(self._subject, at_rest, look):
-            if picture is not None and not viewer.gone:
+            if picture is not None and not (viewer.gone or viewer.stale):  # of an older view
                 viewer.show(picture)
             yield
 
