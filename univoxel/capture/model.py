@@ -66,13 +66,11 @@ def feature_counts(path: Path) -> dict[int, int]:
 def largest_features(path: Path, image: int, most: int) -> np.ndarray:
     """Unit descriptors [N, D] float32 of the features of largest scale."""
     query = "SELECT rows, cols, data FROM {} WHERE image_id = ?"
-    points, described = (
-        next(_rows(path, query.format(table), image), None)
-        for table in ("keypoints", "descriptors")
-    )
-    if not points or not described or not points[0]:
+    points = next(_rows(path, query.format("keypoints"), image), None)
+    described = next(_rows(path, query.format("descriptors"), image), None)
+    if points is None or described is None or not points[0]:
         return np.zeros((0, 128), np.float32)
-    points = np.frombuffer(points[2], np.float32).reshape(points[:2])
+    points = np.frombuffer(points[2], np.float32).reshape(points[0], points[1])
     # x, y, scale, angle; or x, y and a 2x2 matrix
     scale = points[:, 2] if points.shape[1] < 6 else np.hypot(points[:, 2], points[:, 4])
     descriptors = np.frombuffer(described[2], np.uint8).reshape(described[0], -1)

@@ -259,7 +259,7 @@ def _replaced(node: Any, path: list[str], text: str) -> Any:
     if isinstance(node, tuple):
         known = [str(i) for i in range(len(node))]
     else:
-        known = [f.name for f in _fields(node)] if dataclasses.is_dataclass(node) else []
+        known = [f.name for f in _fields(node)] if hasattr(node, "__dataclass_fields__") else []
     if name not in known:
         raise ConfigError(f"no field {name!r}; the fields are: {', '.join(known) or 'none'}")
     if isinstance(node, tuple):

@@ -134,8 +134,10 @@ def panels_of_view(layers: Layers, expected: Expected, scales: Scales) -> list[P
     def mapped(normal: Tensor) -> Tensor:
         return 0.5 * normal + 0.5 * (normal != 0).any(-1, keepdim=True)
 
-    true = {} if mask is None else true_errors(layers, expected, scales)
-    rough, bent = (true[name] * mask if name in true else None for name in ("roughness", "normal"))
+    rough = bent = None
+    if mask is not None:
+        true = true_errors(layers, expected, scales)
+        rough, bent = (true[n] * mask if n in true else None for n in ("roughness", "normal"))
     shown = layers.rgb + expected.behind * (1 - layers.alpha[..., None])
     panels = [
         colors("novel view", shown, expected.photo),

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from scipy import ndimage
+from skimage.measure import label
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -173,7 +174,7 @@ def part_beyond(
         count += seen & beyond[view][row, column]
     share = torch.zeros(grid.size)
     share.view(-1)[index] = count / len(views)
-    parts = torch.from_numpy(np.asarray(ndimage.label((share >= WHOLE).numpy())[0]))
+    parts = torch.from_numpy(np.asarray(label((share >= WHOLE).numpy(), connectivity=1)))
     return torch.isin(parts, parts[share >= CORE].unique())
 
 
