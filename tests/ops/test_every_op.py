@@ -479,13 +479,14 @@ def test_torch_knows_the_op_in_full(case, monkeypatch):
     monkeypatch.undo()
     ((op, inputs),) = called.items()
     torch.library.opcheck(op.defined, inputs)
-    if isinstance(op, Differentiable):
+    if isinstance(op, Differentiable) and not op._traced:
         held, shown = op._held, op._shown
-        saved = [x.detach() for x in inputs[: op._tensors]]
+        saved = [[t.detach() for t in x] if isinstance(x, list) else x.detach()
+                 for x in inputs[: op._tensors]]  # fmt: skip
         out = op(*saved, *inputs[op._tensors :])
         out = [out] if isinstance(out, Tensor) else list(out)
         pulls = [torch.ones_like(o) for o in out[:shown]]
-        asked = [inputs[i].requires_grad for i in op._to]
+        asked = [t.requires_grad for t in flat([inputs[i] for i in op._to])]
         for needs in (asked, [i == 0 for i in range(len(asked))]):
             given = (*saved, *out[shown : shown + held], *pulls, *inputs[op._tensors :], needs)
             torch.library.opcheck(op.backward.defined, given)

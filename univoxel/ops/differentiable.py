@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from itertools import islice
 from typing import Any, List, TypeAlias, get_args  # noqa: UP035
 
 import torch
@@ -92,12 +93,14 @@ def _matches(word: str, size: int, sizes: dict[str, int]) -> bool:
 
 
 LIST: Any = List[Tensor]  # noqa: UP006  torch 2.4 reads no other spelling
+Tensors: TypeAlias = Sequence[Any]  # or lists of tensors among them, as the op takes them
+Lengths: TypeAlias = "list[int | None]"  # of such lists; None stands for a single tensor
 # Called with tensors, options and outputs; fills the outputs
-Forward: TypeAlias = "Callable[[Sequence[Tensor], Sequence, Sequence[Tensor]], None]"
+Forward: TypeAlias = "Callable[[Tensors, Sequence, Sequence[Tensor]], None]"
 # Called with what was saved, gradients of the outputs that are not held, options, and whether each
 # gradient is needed; returns the gradients. In place of one not needed, anything may stand
 Backward: TypeAlias = (
-    "Callable[[Sequence[Tensor], Sequence[Tensor], Sequence, list[bool]], Sequence[Tensor | None]]"
+    "Callable[[Tensors, Sequence[Tensor], Sequence, list[bool]], Sequence[Tensor | None]]"
 )
 
 
@@ -133,6 +136,7 @@ def differentiable(to: str, **settings: Any) -> Callable[[Callable], Differentia
             and are saved after the tensors.
         optional: those of `to` whose gradient is an empty array where it is not needed. The kernel
             computes the others always.
+        traced: backward is made of torch's operations and is no op. It takes what is held only.
     """
     return lambda allocate: Differentiable(allocate, to.split(), **settings)
 
@@ -149,39 +153,44 @@ class Differentiable(native.Operator):
         backward: Backward | None = None,
         held: int = 0,
         optional: str = "",
+        traced: bool = False,
     ) -> None:
         name = name or allocate.__name__.removeprefix("_")
         hints = native.hints_of(allocate)
         arguments = {n: h for n, h in hints.items() if n != "return"}
-        tensors = {n: h for n, h in arguments.items() if h is Tensor}
+        tensors = {n: h for n, h in arguments.items() if h in (Tensor, LIST)}
         options = {n: h for n, h in arguments.items() if n not in tensors}
         outputs = get_args(hints["return"]) or (Tensor,)
+        lists = LIST in tensors.values()
         assert [*arguments] == [*tensors, *options], "tensors come before options"
+        assert not lists or to == [*tensors], "with list arguments, `to` must name every tensor"
         self._to = [[*tensors].index(n) for n in to]
         self._count, self._tensors = len(arguments), len(tensors)
         self._held, self._shown = held, len(outputs) - held
         self._sparse = [*options].index("sparse_grad") if "sparse_grad" in options else None
+        self._traced = traced
         spared = [n in optional.split() for n in to]
         self._find = backward or _backward_by_name(name, self._to, spared)
         fill = forward or _forward_by_name(name)
         n, several = len(tensors), len(outputs) > 1
 
-        def run(tensors: Sequence[Tensor], options: Sequence) -> Any:
+        def run(tensors: Tensors, options: Sequence) -> Any:
             out = allocate(*tensors, *options)
             fill(tensors, options, out if several else (out,))
             return out
 
         super().__init__(name, lambda *inputs: run(inputs[:n], inputs[n:]), hints, allocate)
         self._run = run
-        self._function = self._register()
-        more = [f"held_{i}" for i in range(held)] + [f"grad_{i}" for i in range(self._shown)]
-        needs = {"needs": List[bool]}  # noqa: UP006
-        self.backward: native.Operator = native.Operator(
-            f"{name}_backward",
-            self._backward_kernel,
-            tensors | dict.fromkeys(more, Tensor) | options | needs | {"return": LIST},
-            self._backward_fake,
-        )
+        self._function = self._register_lists() if lists else self._register()
+        if not traced:
+            more = [f"held_{i}" for i in range(held)] + [f"grad_{i}" for i in range(self._shown)]
+            needs = {"needs": List[bool]}  # noqa: UP006
+            self.backward: native.Operator = native.Operator(
+                f"{name}_backward",
+                self._backward_kernel,
+                tensors | dict.fromkeys(more, Tensor) | options | needs | {"return": LIST},
+                self._backward_fake,
+            )
 
     def __call__(self, *arguments: Any) -> Any:
         if forward_ad._current_level >= 0:
@@ -194,7 +203,7 @@ class Differentiable(native.Operator):
 
     def _refuse_tangents(self, arguments: Sequence) -> None:
         """Raise where a derivative in forward mode is asked for, which torch would take for 0."""
-        given = [t for t in arguments if isinstance(t, Tensor) and t.is_floating_point()]
+        given = [t for t in _flat(arguments) if isinstance(t, Tensor) and t.is_floating_point()]
         if any(forward_ad.unpack_dual(t).tangent is not None for t in given):
             raise NotImplementedError(
                 f"{self.name}: forward mode (jvp, jacfwd, dual numbers) is not supported: use "
@@ -228,11 +237,40 @@ class Differentiable(native.Operator):
             return tuple(result)
 
         self.defined.register_autograd(backward, setup_context=save)
-        methods = {"forward": staticmethod(forward), "backward": staticmethod(backward)}
-        function = type(self.name, (torch.autograd.Function,), methods)
-        # Its own `apply` looks for functorch's transforms first, as `goes_by_library` has done
-        beyond: Any = super(torch.autograd.Function, function)
-        return beyond.apply
+        return _autograd_function(self.name, forward, backward)
+
+    def _register_lists(self) -> Callable:
+        """The same where there are lists of tensors. Autograd functions see single ones only."""
+        run, n = self._run, self._tensors
+        none = [None] * (self._count - n)
+
+        def save(ctx: Any, inputs: Sequence, output: Any) -> None:
+            ctx.lengths = _lengths(inputs[:n])
+            self._save(ctx, _flat(inputs[:n]), inputs[n:], output)
+
+        def backward(ctx: Any, *grads: Tensor | None) -> tuple:
+            found = gradients(ctx, grads, _flat(ctx.needs_input_grad[:n]))
+            return *_grouped(found, ctx.lengths), *none
+
+        def gradients(ctx: Any, grads: Sequence[Tensor | None], needs: list[bool]) -> list:
+            saved = _grouped(ctx.saved_tensors, ctx.lengths)
+            found = self._gradients(saved, grads, ctx.options, needs)
+            return [g if need else None for g, need in zip(found, needs, strict=True)]
+
+        # What comes one by one is what autograd sees; the kernel reads the same, as the op takes it
+        def forward_of_single(ctx: Any, inputs: Sequence, *flat: Tensor) -> Any:
+            tensors, options = inputs[:n], inputs[n:]
+            output = run(tensors, options)
+            ctx.lengths = _lengths(tensors)
+            self._save(ctx, flat, options, output)
+            return output
+
+        def backward_of_single(ctx: Any, *grads: Tensor | None) -> tuple:
+            return None, *gradients(ctx, grads, ctx.needs_input_grad[1:])
+
+        self.defined.register_autograd(backward, setup_context=save)
+        apply = _autograd_function(self.name, forward_of_single, backward_of_single)
+        return lambda *inputs: apply(inputs, *_flat(inputs[:n]))
 
     def _save(self, ctx: Any, tensors: Sequence, options: Sequence, output: Any) -> None:
         ctx.options = options
@@ -241,12 +279,13 @@ class Differentiable(native.Operator):
             return
         held = output[self._shown :]
         ctx.mark_non_differentiable(*held)
-        ctx.save_for_backward(*tensors, *held)
+        saved = [tensors[i] for i in self._to] if self._traced else tensors
+        ctx.save_for_backward(*saved, *held)
         if self._shown == 1:  # no zeros for what is held, which may be large
             ctx.set_materialize_grads(False)
 
     def _gradients(
-        self, saved: Sequence[Tensor], grads: Sequence[Any], options: Sequence, needs: list[bool]
+        self, saved: Tensors, grads: Sequence[Any], options: Sequence, needs: list[bool]
     ) -> Sequence[Tensor | None]:
         """What backward finds. Where a graph of it is asked for, going through that raises."""
         if not torch.is_grad_enabled():
@@ -255,13 +294,15 @@ class Differentiable(native.Operator):
             found = self._found(saved, grads, options, needs)
         there = [g for g in found if g is not None]
         # Of constant gradients, too, such as those of a sum: they depend on what was saved
-        marked = iter(_Once.apply(self.name, len(there), *there, *saved, *grads))
+        marked = iter(_Once.apply(self.name, len(there), *there, *_flat(saved), *grads))
         return [None if g is None else next(marked) for g in found]
 
     def _found(
-        self, saved: Sequence[Tensor], grads: Sequence[Any], options: Sequence, needs: list[bool]
+        self, saved: Tensors, grads: Sequence[Any], options: Sequence, needs: list[bool]
     ) -> Sequence[Tensor | None]:
         """What backward finds, by the shortest way there is."""
+        if self._traced:
+            return self._find(saved[len(self._to) :], grads, options, needs)
         grads = [g.contiguous() for g in grads[: self._shown]]
         sparse = self._sparse is not None and options[self._sparse]
         if sparse or not native.goes_by_library((*saved, *grads)):
@@ -280,7 +321,7 @@ class Differentiable(native.Operator):
         ]
 
     def _backward_fake(self, *arguments: Any) -> list[Tensor]:
-        tensors = (arguments[i] for i in self._to)
+        tensors = _flat(arguments[i] for i in self._to)
         return [
             torch.empty_like(x) if need else x.new_empty(0)
             for x, need in zip(tensors, arguments[-1], strict=True)
@@ -306,7 +347,7 @@ class _Once(torch.autograd.Function):
 def _forward_by_name(name: str) -> Forward:
     name = f"{name}_forward"
 
-    def forward(tensors: Sequence[Tensor], options: Sequence, outputs: Sequence[Tensor]) -> None:
+    def forward(tensors: Tensors, options: Sequence, outputs: Sequence[Tensor]) -> None:
         kernel = getattr(native.require(), name)
         kernel(*native.arrays(*tensors, *outputs), *options, native.threads())
 
@@ -317,7 +358,7 @@ def _backward_by_name(name: str, to: list[int], optional: list[bool]) -> Backwar
     name = f"{name}_backward"
 
     def backward(
-        saved: Sequence[Tensor], grads: Sequence[Tensor], options: Sequence, needs: list[bool]
+        saved: Tensors, grads: Sequence[Tensor], options: Sequence, needs: list[bool]
     ) -> list[Tensor]:
         found = [
             torch.empty_like(saved[i]) if need or not spared else saved[i].new_empty(0)
@@ -328,3 +369,33 @@ def _backward_by_name(name: str, to: list[int], optional: list[bool]) -> Backwar
         return found
 
     return backward
+
+
+def _autograd_function(name: str, forward: Callable, backward: Callable) -> Callable:
+    methods = {"forward": staticmethod(forward), "backward": staticmethod(backward)}
+    function = type(name, (torch.autograd.Function,), methods)
+    # Its own `apply` looks for functorch's transforms first, as `goes_by_library` has done
+    beyond: Any = super(torch.autograd.Function, function)
+    return beyond.apply
+
+
+def _lengths(tensors: Tensors) -> Lengths:
+    return [len(t) if isinstance(t, list) else None for t in tensors]
+
+
+def _flat(values: Iterable) -> list:
+    """Values, those of lists one by one."""
+    flat = []
+    for value in values:
+        if isinstance(value, (list, tuple)):
+            flat += value
+        else:
+            flat.append(value)
+    return flat
+
+
+def _grouped(flat: Iterable, lengths: Lengths) -> list:
+    """What `_flat` was made of, and what follows it."""
+    rest = iter(flat)
+    groups = [next(rest) if n is None else list(islice(rest, n)) for n in lengths]
+    return [*groups, *rest]

@@ -47,8 +47,9 @@ def mlp(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tenso
     if empty:
         raise ValueError(f"mlp: every layer must be at least 1 wide, got {empty[0]}=0")
     if native.serves(x):
-        packed = torch.cat([t.flatten() for t in (*weights, *biases)])
-        return _mlp(x.contiguous(), packed, [x.shape[1], *map(len, biases)])
+        return _mlp(
+            x.contiguous(), [w.contiguous() for w in weights], [b.contiguous() for b in biases]
+        )
     return mlp_reference(x, weights, biases)
 
 
@@ -59,35 +60,32 @@ def mlp_reference(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]
     return torch.nn.functional.linear(x, weights[-1], biases[-1])
 
 
-def _layers(packed: Tensor, widths: list[int]) -> tuple[list, list]:
-    """Weights and biases of layers, one after another in a tensor, as the extension takes them."""
-    n = len(widths) - 1
-    parts = packed.split([i * o for i, o in pairwise(widths)] + widths[1:])
-    layers = native.arrays(*parts)
-    return layers[:n], layers[n:]
-
-
-def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) -> None:
-    x, out = native.arrays(tensors[0], *outputs)
-    native.require().mlp_forward(x, *_layers(tensors[1], *options), out, native.threads())
+def _forward(tensors: Sequence, _: Sequence, outputs: Sequence[Tensor]) -> None:
+    x, weights, biases = tensors
+    n = len(weights)
+    x, *layers, out = native.arrays(x, *weights, *biases, *outputs)
+    native.require().mlp_forward(x, layers[:n], layers[n:], out, native.threads())
 
 
 def _backward(
-    saved: Sequence, grads: Sequence[Tensor], options: Sequence, needs: list[bool]
+    saved: Sequence, grads: Sequence[Tensor], _: Sequence, needs: list[bool]
 ) -> list[Tensor | None]:
-    of_x, of_packed = (
-        torch.empty_like(t) if n else None for t, n in zip(saved, needs, strict=True)
+    """Gradients to all layers or to none."""
+    x, weights, biases = saved
+    n, need_x, need_layers = len(weights), needs[0], any(needs[1:])
+    of_x = torch.empty_like(x) if need_x else None
+    of_layers = [torch.empty_like(t) for t in (*weights, *biases)] if need_layers else []
+    x, *layers, grad_out = native.arrays(x, *weights, *biases, *grads)
+    into_x, *into = native.arrays(of_x, *of_layers)
+    native.require().mlp_backward(
+        x, layers[:n], layers[n:], grad_out, into_x, into[:n], into[n:], native.threads()
     )
-    into = ([], []) if of_packed is None else _layers(of_packed, *options)
-    x, grad_out, into_x = native.arrays(saved[0], *grads, of_x)
-    layers = _layers(saved[1], *options)
-    native.require().mlp_backward(x, *layers, grad_out, into_x, *into, native.threads())
-    return [of_x, of_packed]
+    return [of_x, *(of_layers or [None] * (2 * n))]
 
 
-@differentiable(to="x packed", forward=_forward, backward=_backward)
-def _mlp(x: Tensor, packed: Tensor, widths: list[int]) -> Tensor:
-    return x.new_empty(len(x), widths[-1])
+@differentiable(to="x weights biases", forward=_forward, backward=_backward)
+def _mlp(x: Tensor, weights: list[Tensor], biases: list[Tensor]) -> Tensor:
+    return x.new_empty(len(x), len(biases[-1]))
 
 
 # Small networks that decode what was composited along a ray, and what they read of directions.

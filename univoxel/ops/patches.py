@@ -150,11 +150,10 @@ def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) ->
 def _backward(
     saved: Sequence, grads: Sequence[Tensor], options: Sequence, needs: list[bool]
 ) -> Sequence[Tensor]:
-    both = (grads[0][..., None] * saved[-1]).sum(1)
-    return [part.contiguous() for part in both.split(3, 1)]
+    return (grads[0][..., None] * saved[0]).sum(1).split(3, 1)
 
 
-@differentiable(to="position normal", forward=_forward, backward=_backward, held=1)
+@differentiable(to="position normal", forward=_forward, backward=_backward, held=1, traced=True)
 def _patch_correlation(
     brightness: Tensor,
     projection: Tensor,
