@@ -187,9 +187,10 @@ def best_object(masks: Sequence[Tensor], maps: DepthMaps) -> tuple[ObjectShape, 
     """
     by_masks = find_object(masks, replace(maps, known=torch.zeros_like(maps.known)))
     by_depth = find_object(masks, maps)
-    both = torch.minimum(by_depth.inside, resample(by_masks.inside, by_masks.grid, by_depth.grid))
+    by_masks_here = resample(by_masks.inside, by_masks.grid, by_depth.grid)
+    both = replace(by_depth, inside=torch.minimum(by_depth.inside, by_masks_here))
     found = []
-    for shape in (replace(by_depth, inside=both), by_masks):
+    for shape in (both, by_masks) if (both.inside > 0).any() else (by_masks,):
         shown = list(silhouettes(shape, maps.cameras))
         differs = [thick((m >= 0.5) != one) for m, one in zip(masks, shown, strict=True)]
         found.append((shape, shown, sum(int(one.sum()) for one in differs)))
