@@ -4,6 +4,7 @@ import io
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from univoxel.color import linear_to_srgb
 from univoxel.core.records import Surface
 from univoxel.data import Photos
 from univoxel.detail import texture
+from univoxel.detail import views as detail_views
 from univoxel.detail.texture import load_detail, make_detail, page_options, save_detail
 from univoxel.detail.views import DetailedViews, coherence, likenesses
 from univoxel.errors import DataError
@@ -35,7 +37,7 @@ from univoxel.output.surface import surface_of
 from univoxel.render.pictures import preview
 from univoxel.render.pipeline import shade, shade_hits, surface_of_view
 from univoxel.run import photos_of
-from univoxel.scene import load_checkpoint, save_scene
+from univoxel.scene import load_checkpoint, load_scene, save_scene
 
 RADIUS, SIZE, VIEWS = 0.4, 240, 12
 DATA = Path(univoxel.__file__).parent / "example_data" / "tiny"
@@ -193,6 +195,20 @@ def test_measures_and_reports_show_it(scene, photos, detail):
     assert albedo[fine.inside][:, 0].std() > 0.8 * printed(torch.randn(9999, 3))[:, 0].std()
 
 
+@pytest.mark.parametrize("fit_light", [False, True])
+def test_a_run_with_a_texture_is_measured_by_nearby_photographs(tiny_copy, fit_light, monkeypatch):
+    """At both sizes; a light that is fitted to a test view is not that of the photographs."""
+    run = tiny_copy / "run"
+    plain = evaluate(run, data=DATA, fit_light=fit_light)
+    monkeypatch.setattr(texture, "PIXELS_OF_VOXEL", 0.0)
+    made = make_detail(load_scene(run), photos_of(run, DATA, "train"), 256)
+    assert made is not None
+    save_detail(made, run)
+    found = evaluate(run, data=DATA, fit_light=fit_light, full_size=True)
+    assert found["nvs_psnr"] > plain["nvs_psnr"]
+    assert found["full_ssim"] > 0  # of pictures so small there is nothing else
+
+
 def test_runs_are_measured_rendered_and_reported_with_it(tiny_copy, monkeypatch):
     run, asked = tiny_copy / "run", []
 
@@ -204,6 +220,10 @@ def test_runs_are_measured_rendered_and_reported_with_it(tiny_copy, monkeypatch)
     assert before["albedo_psnr_3ch"] is not None
     for module in (texture, api):
         monkeypatch.setattr(module, "albedo_near", lambda run: half)
+    fake = SimpleNamespace(
+        detail=SimpleNamespace(near=half), render=lambda c, v, rgb, _: (rgb, rgb)
+    )
+    monkeypatch.setattr(detail_views, "detailed_views", lambda *_: fake)
     assert Run(run).render()[..., :3].mean() < 0.8 * mean
     after = evaluate(run, data=DATA)
     assert after["nvs_psnr"] != before["nvs_psnr"]  # another picture

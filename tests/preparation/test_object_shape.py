@@ -119,8 +119,9 @@ def test_depth_and_masks_find_the_object(room, spoilt):
 def test_depth_that_contradicts_the_masks_is_not_believed(room):
     """As of a mirror: depth lies behind the object's surface."""
     _, masks, maps = room
-    behind = torch.stack([m >= 0.5 for m in masks]) * 0.8
-    for known, asked in ((maps, True), (replace(maps, distance=maps.distance + behind), False)):
+    object_ = torch.stack([m >= 0.5 for m in masks])
+    behind, far = (replace(maps, distance=maps.distance + x * object_) for x in (0.8, 100.0))
+    for known, asked in ((maps, True), (behind, False), (far, False)):
         shape, shown = best_object(masks, known)
         assert (shape.surface > 0) == asked
         agree = [iou(s, m) for s, m in zip(shown, masks, strict=True)]

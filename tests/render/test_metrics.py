@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from skimage.metrics import structural_similarity
 
 from univoxel.core.records import Mesh
 from univoxel.render import metrics
@@ -156,3 +157,23 @@ DIFFER = r"equal sizes, got \[4, 4, 3\] and \[5, 5, 3\]"
 def test_what_cannot_be_measured(measure, arguments, message):
     with pytest.raises(ValueError, match=message):
         measure(*arguments)
+
+
+@pytest.mark.parametrize("place", [(0, 0), (-1, -1), (3, -4), (20, 15)])
+@pytest.mark.parametrize("size", [(40, 31), (11, 11)])
+def test_ssim_where_little_differs_is_that_of_the_whole(size, place):
+    """Only what is around the differing pixels is looked at."""
+    picture = torch.rand(*size, 3, generator=torch.Generator().manual_seed(0))
+    other = picture.clone()
+    row, column = (min(at, n - 1) for at, n in zip(place, size, strict=True))
+    other[row, column] = 1 - other[row, column]
+    whole = structural_similarity(
+        picture.double().numpy(),
+        other.double().numpy(),
+        data_range=1.0,
+        channel_axis=-1,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+    )
+    assert metrics.ssim(picture, other) == pytest.approx(whole, abs=1e-9)

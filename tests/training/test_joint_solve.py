@@ -499,6 +499,21 @@ def test_bright_albedo_stays():
         torch.testing.assert_close(scene.material(features)[0], before)
 
 
+def test_a_bright_albedo_under_coloured_light_keeps_its_contrast():
+    """Where the light's colour would make it brighter than white paint, both stay darker."""
+    scene, problem = sphere_of((0.1, 0.1, 0.1), 0.5, 0.5)
+    features = scene.field.features_at(problem.observations.position)
+    with torch.no_grad():
+        scene.material.shift_albedo(features, torch.full((3,), 0.85))
+        tint_(scene, torch.tensor([1.4, 0.95, 0.65]))
+        before = scene.sky.radiance * scene.material(features)[0].median(0).values
+        nothing = torch.zeros(len(features), dtype=torch.bool)
+        joint_solve.set_level_(scene, problem, nothing, 0.0)
+        median = scene.material(features)[0].median(0).values
+    assert median.max() < joint_solve.WHITE + 0.01
+    torch.testing.assert_close(scene.sky.radiance * median, before, rtol=1e-3, atol=0)
+
+
 def test_metal_parts_bound_the_level(monkeypatch):
     """They would come out brighter than any metal is."""
     scene, problem = sphere_of((0.1, 0.1, 0.1), 0.5, 0.5)

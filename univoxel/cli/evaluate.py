@@ -74,7 +74,8 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
     """Metrics of a trained scene on its test views, with the keys of `MEASURES`.
 
     Arguments are the fields of `EvaluateOptions`. Whole images are compared in sRGB, clipped to
-    [0, 1] and composited on black, except for novel views, which are composited on `background`.
+    [0, 1] and composited on black, except for novel views, which are composited on `background`. If
+    the run has a full-size texture, novel views use it and are corrected by nearby photographs.
     Each metric is a mean over the views (and maps); `univoxel.evaluation.measures` and
     `univoxel.render.metrics` define the metrics. A metric is None if the data set has no ground
     truth for it. The log describes what the photographs determine weakly.
@@ -97,7 +98,6 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
     """
     from statistics import fmean
 
-    from univoxel.detail.texture import albedo_near
     from univoxel.detail.views import detailed_views, measure_full_size
     from univoxel.evaluation import views
     from univoxel.evaluation.measures import (
@@ -126,11 +126,11 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
 
     surveyed = views.survey_of(scene, run, data)
     mesh = extract_mesh(scene) if truth.maps or truth.points is not None else None
-    near = albedo_near(run)
+    detailed = detailed_views(scene, run, data)
+    near = None if detailed is None else detailed.detail.near
     scales = albedo_scales(scene, photos, near)
     relighting = views.relighting_of(scene, mesh, truth, scales, asked.samples, asked.bounces)
     how = {"background": asked.background, "fit_light": asked.fit_light, "save": save}
-    detailed = detailed_views(scene, run, data)
     how |= {"albedo_near": near, "novel": detailed and detailed.render}
     found = views.measure_views(scene, photos, truth, scales, relighting, surveyed, **how)
     result = {key: fmean(values) if values else None for key, values in found.measures.items()}

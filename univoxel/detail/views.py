@@ -80,6 +80,7 @@ class DetailedViews:
         self.detail: Detail = detail
         self.at: Vertices = vertices_of(scene, Mesh(detail.vertices, detail.faces))
         self.photos: Photos | None = None
+        self._one_light = scene.views is None
         if photos is not None and photos.readers:
             self.photos = scene.registered(photos)
         self._kept: OrderedDict[int, _Photo] = OrderedDict()
@@ -205,7 +206,13 @@ class DetailedViews:
             values = torch.zeros(len(quality), 7)
             seen = quality > 0
             part = at_rays(self.at.surface, seen)
-            values[seen, :6] = torch.cat(split(self.scene, part, cameras, view, view), 1)
+            shown = self.scene.views
+            if self._one_light:  # a light that was fitted to a test view is not the photographs'
+                self.scene.views = None
+            try:
+                values[seen, :6] = torch.cat(split(self.scene, part, cameras, view, view), 1)
+            finally:
+                self.scene.views = shown
             values[:, 6] = quality / quality.max().clamp_min(1e-30)
             picture = self.photos.readers[view](1)
             if self._scale < 1 - SAME:
@@ -220,7 +227,8 @@ def detailed_views(scene: Scene, run: Path, data: Path | None) -> DetailedViews 
     """What renders the views of a run with its detail; None: it has none.
 
     Args:
-        data: as in `univoxel.run.photos_of`. Where no photographs are found, views are the model's.
+        data: as in `univoxel.run.photos_of`. Where it has no photographs, or others, views are the
+            model's.
 
     Raises:
         DataError: as `load_detail`.
@@ -230,17 +238,19 @@ def detailed_views(scene: Scene, run: Path, data: Path | None) -> DetailedViews 
         return None
     try:
         train = photos_of(run, data, "train")
+        if scene.cfg.views and list(scene.cfg.views) != train.names:
+            raise UserError(f"{train.folder} has other photographs than the run was trained on")
+        return DetailedViews(scene, detail, train)
     except (UserError, OSError) as error:
-        log.info("no training photographs found, so novel views use only the model: %s", error)
-        train = None
-    return DetailedViews(scene, detail, train)
+        log.info("novel views use only the model, not the training photographs: %s", error)
+        return DetailedViews(scene, detail)
 
 
 def _shrunk(picture: Tensor, scale: float) -> Tensor:
     """A stored picture [H, W, 3] of `scale` times the size, < 1, linear where it was not."""
     planes = linear(picture).movedim(-1, 0)
     small = interpolate(planes[None], scale_factor=scale, mode="bilinear", antialias=True)
-    return small[0].movedim(0, -1)
+    return small[0].movedim(0, -1).contiguous()
 
 
 def _enlarged(picture: Tensor, width: int, height: int) -> Tensor:
@@ -316,7 +326,7 @@ def measure_full_size(
     """Novel views at the size of their photographs' files against these, by `FULL_MEASURES`.
 
     Args:
-        views: None: views are enlarged.
+        views: None: the model's views, enlarged.
         save: folder for NAME_full.exr, the view as half floats: rgb.*, linear on black, and alpha.
     """
     found: tuple[list[Likeness], list[Likeness]] = ([], [])

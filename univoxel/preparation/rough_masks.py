@@ -5,8 +5,8 @@ pixel tells neither of the object nor of emptiness.
 
 A part may have moved when the object was turned over, such as a lid or a limb. Then photographs of
 each position of the object agree with one another, but not with those of another position. The
-model has the part where most photographs show it. The others tell nothing of that place, and
-nothing of where they show the part.
+model has the part where the position with the most photographs shows it. The others tell nothing of
+that place, and nothing of where they show the part.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from univoxel.core import log, memmap
 from univoxel.core.memmap import parallel_map
 from univoxel.data import Photos
 from univoxel.data.photos import coverage_of
+from univoxel.errors import UserError
 from univoxel.fields.distances import DenseDistances
 from univoxel.fields.grid import GridShape, fit_grid, resample
 from univoxel.lights.views import positions_of
@@ -39,6 +40,7 @@ from univoxel.preparation.hull import (
 from univoxel.preparation.object_shape import (
     ObjectShape,
     find_object,
+    largest_part,
     shrunk,
     silhouettes,
 )
@@ -50,8 +52,8 @@ from univoxel.preparation.stereo import DepthMaps, depth_maps, pixels_of
 JAGGED = 2.0
 # Voxels along a side of the grid, on average, on which parts that moved are looked for
 VOXELS = 96
-# Share of the photographs of a position whose masks show a place beyond the hull of all: somewhere
-# in a part that moved, and everywhere in it
+# Share of a position's photographs whose masks show a place beyond the hull that it shares with the
+# largest position: somewhere in a part that moved, and everywhere in it
 CORE, WHOLE = 0.2, 0.05
 # Voxels around these places: most of such a part lies in the hulls of both positions
 NEAR = 4
@@ -94,7 +96,7 @@ def doubt_masks(photos: Photos, distance: Tensor, belief: Belief) -> Doubted:
     fill_(distance, photos, pixels)
     box = estimate_bounds(distance, cameras, belief.votes)
     off = contradiction(distance, cameras, box, pixels)
-    told = "the other masks (depth is ignored, because it disagrees with most masks)"
+    told = "the other masks (depth is not used, because the shape fits the masks better without it)"
     if shape.surface:
         told = "the other masks and the depth, which is known for "
         told += f"{shape.surface:.0%} of the surface"
@@ -109,8 +111,9 @@ def doubt_masks(photos: Photos, distance: Tensor, belief: Belief) -> Doubted:
 
 
 def undo_moves_(masks: list[Tensor], maps: DepthMaps, box: tuple[Tensor, Tensor]) -> list[Tensor]:
-    """Where photographs show a part elsewhere than most do: V times [h, w] bool. There, masks
-    become those of the part in its place, and depths unknown.
+    """Where photographs show a part elsewhere than the largest position: V times [h, w] bool.
+
+    Changes `masks` there to show the part in its place, and `maps.known` to False.
 
     Args:
         masks: V, [h, w] in [0, 1] of the sizes of the depth maps.
@@ -124,7 +127,7 @@ def undo_moves_(masks: list[Tensor], maps: DepthMaps, box: tuple[Tensor, Tensor]
     hulls = [visual_hull(distance[p], cameras.of(p), grid, votes_needed(len(p))) for p in positions]
     for hull, position in zip(hulls[1:], positions[1:], strict=True):
         shared = torch.maximum(hulls[0], hull)
-        if not (shared < 0).any():
+        if not shared.min() < 0 < shared.max():
             continue
         shown = silhouettes(ObjectShape(grid, -shared, 0.0), cameras)
         beyond = [thick((mask >= 0.5) & ~one) for mask, one in zip(masks, shown, strict=True)]
@@ -186,9 +189,12 @@ def best_object(masks: Sequence[Tensor], maps: DepthMaps) -> tuple[ObjectShape, 
     reflection: then the object's silhouettes lose what all masks show.
     """
     by_masks = find_object(masks, replace(maps, known=torch.zeros_like(maps.known)))
-    by_depth = find_object(masks, maps)
+    try:
+        by_depth = find_object(masks, maps)
+    except UserError:  # depth of reflections may leave nothing
+        return by_masks, list(silhouettes(by_masks, maps.cameras))
     by_masks_here = resample(by_masks.inside, by_masks.grid, by_depth.grid)
-    both = replace(by_depth, inside=torch.minimum(by_depth.inside, by_masks_here))
+    both = replace(by_depth, inside=largest_part(torch.minimum(by_depth.inside, by_masks_here)))
     found = []
     for shape in (both, by_masks) if (both.inside > 0).any() else (by_masks,):
         shown = list(silhouettes(shape, maps.cameras))

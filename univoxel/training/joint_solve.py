@@ -84,6 +84,7 @@ METALLIC_WEIGHT = 0.01
 # former counts as much as photographs whose `NewtonRound.level` is LEVEL: on the bank's tuning
 # half, the level is 2e-4 to 4e-4 for rough objects and 5e-3 for glossy ones
 ORDINARY, ORDINARY_METAL, LEVEL = 0.35, 0.55, 1.7e-3
+WHITE = 0.9  # albedo of white paint, in each channel
 FEW_METALS = 0.05  # share of the points up to which their brightness means nothing
 
 
@@ -215,7 +216,8 @@ def set_level_(scene: Scene, problem: JointProblem, metal: Tensor, evidence: flo
     reflection of dielectrics, which no albedo changes, tells how bright and of what colour the
     light is: little, if they are rough, and every other reason why brightness changes with the view
     counts as such a reflection. So the maps of rough objects come out several times too bright. But
-    cameras balance the colours of photographs so that the light looks white.
+    cameras balance the colours of photographs so that the light looks white. A flash is white: with
+    one, the map keeps its colour.
 
     Args:
         metal: [N] bool, of the points.
@@ -227,7 +229,7 @@ def set_level_(scene: Scene, problem: JointProblem, metal: Tensor, evidence: flo
     albedo = scene.material(features)[0]
     median = albedo.median(0).values
     light = problem.sky.radiance.mean(0)
-    factor = torch.ones(3) if scene.flash else (light / light.mean()) ** share
+    factor = (light / light.mean()) ** share if scene.flash is None else torch.ones(3)
     albedo = factor * albedo
     if metal.all():
         level = ORDINARY_METAL / albedo.mean(0).max()
@@ -236,6 +238,9 @@ def set_level_(scene: Scene, problem: JointProblem, metal: Tensor, evidence: flo
         if metal.float().mean() > FEW_METALS:  # their reflectance rises with the albedo of the rest
             most = ORDINARY_METAL / albedo[metal].amax(1).mean()
             level = torch.minimum(level, most.clamp_min(1.0))
+    # An albedo that would be brighter than white paint would lose its contrast
+    brightest = median.amax().clamp_min(WHITE)
+    level = level / ((level * factor * median).amax() / brightest).clamp_min(1.0)
     factor = level * factor
     scene.material.shift_albedo(features, factor * median)
     problem.sky.log_radiance.sub_(factor.log())
