@@ -19,9 +19,9 @@ sys.path.insert(0, str(ROOT / "tests"))
 from layers import LAYERS, violations  # noqa: E402
 
 LIMITS = {
-    "lines of the package": 38_035,
+    "lines of the package": 38_040,
     "lines of the laboratory": 5_300,
-    "lines of tests": 37_370,
+    "lines of tests": 37_380,
     "modules of the package": 165,
     "loose modules at the top": 12,
     "configuration fields": 128,

@@ -184,6 +184,9 @@ def test_the_preview_shows_it(scene, photos, detail, tmp_path, monkeypatch):
     even = spread()
     assert write(scene, photos, tmp_path) == tmp_path / "detail"
     assert spread() > 5 * even + 5  # of 255; the model's albedo is even
+    monkeypatch.setattr(texture, "make_detail", lambda *_: None)
+    assert write(scene, photos, tmp_path) is None
+    assert spread() == even  # nor does it show a texture that is gone
 
 
 def test_measures_and_reports_show_it(scene, photos, detail):

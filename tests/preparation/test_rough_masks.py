@@ -134,8 +134,15 @@ def test_preparation_doubts_what_contradicts_and_starts_from_what_agrees(
     assert found.shape is not None
     assert found.doubted.any()
     assert not found.edges_given
+    asked_of = []
+    monkeypatch.setattr(
+        prepare, "varying_and_gains", lambda photos, *_: asked_of.append(photos) or ("none", None)
+    )
     hull = prepare.prepare(found, cfg).hull
     assert hull.min() < 0 < hull.max()
+    [seen] = asked_of
+    assert not seen.alpha[found.doubted].any()
+    assert torch.equal(seen.alpha[~found.doubted], spoilt.alpha[~found.doubted])
     # Where depth was not asked, concavities are still to be found
     carved = []
     monkeypatch.setattr(prepare, "carve_within_time", lambda hull, *_: carved.append(1) or hull)

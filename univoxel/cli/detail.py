@@ -75,12 +75,15 @@ def write(scene: Scene, photos: Photos, run: Path, size: int | None = None) -> P
     from univoxel.detail.texture import FOLDER, make_detail, save_detail
     from univoxel.render.pictures import preview
 
+    before = (run / FOLDER).is_dir()
     shutil.rmtree(run / FOLDER, ignore_errors=True)
     detail = make_detail(scene, photos, size)
+    if before or detail is not None:
+        seen, near = scene.registered(photos), detail and detail.near
+        preview(scene, seen, run / "preview.png", albedo_near=near)
     if detail is None:
         return None
     save_detail(detail, run)
-    preview(scene, scene.registered(photos), run / "preview.png", albedo_near=detail.near)
     return run / FOLDER
 
 

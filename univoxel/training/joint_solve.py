@@ -223,15 +223,15 @@ def set_level_(scene: Scene, problem: JointProblem, metal: Tensor, evidence: flo
         metal: [N] bool, of the points.
         evidence: `NewtonRound.level`.
     """
-    features, share = scene.field.features_at(problem.observations.position), 1.0
-    if not metal.all():
-        share = LEVEL / (LEVEL + evidence)
+    all_metal = bool(metal.all())
+    share = 1.0 if all_metal else LEVEL / (LEVEL + evidence)
+    features = scene.field.features_at(problem.observations.position)
     albedo = scene.material(features)[0]
     median = albedo.median(0).values
     light = problem.sky.radiance.mean(0)
     factor = (light / light.mean()) ** share if scene.flash is None else torch.ones(3)
     albedo = factor * albedo
-    if metal.all():
+    if all_metal:
         level = ORDINARY_METAL / albedo.mean(0).max()
     else:
         level = (ORDINARY / luminance(albedo[~metal]).mean()).clamp_min(1.0) ** share
