@@ -21,7 +21,7 @@ from layers import LAYERS, violations  # noqa: E402
 LIMITS = {
     "lines of the package": 38_040,
     "lines of the laboratory": 5_300,
-    "lines of tests": 37_380,
+    "lines of tests": 37_395,
     "modules of the package": 165,
     "loose modules at the top": 12,
     "configuration fields": 128,

@@ -198,6 +198,16 @@ def test_measures_and_reports_show_it(scene, photos, detail):
     assert albedo[fine.inside][:, 0].std() > 0.8 * printed(torch.randn(9999, 3))[:, 0].std()
 
 
+def test_other_photographs_do_not_correct_views(scene, photos, detail, monkeypatch, caplog):
+    monkeypatch.setattr(detail_views, "load_detail", lambda _: detail)
+    monkeypatch.setattr(detail_views, "photos_of", lambda *_: photos)
+    assert detail_views.detailed_views(scene, Path(), None).photos is not None
+    monkeypatch.setattr(scene, "cfg", replace(scene.cfg, views=("another",)))
+    with caplog.at_level("INFO"):
+        assert detail_views.detailed_views(scene, Path(), None).photos is None
+    assert "has other photographs than the run was trained on" in caplog.text
+
+
 @pytest.mark.parametrize("fit_light", [False, True])
 def test_a_run_with_a_texture_is_measured_by_nearby_photographs(tiny_copy, fit_light, monkeypatch):
     """At both sizes; a light that is fitted to a test view is not that of the photographs."""
