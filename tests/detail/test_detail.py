@@ -17,17 +17,18 @@ from torch.nn.functional import normalize
 
 import univoxel
 from univoxel import Run, api, evaluate
-from univoxel.camera import image_rays
+from univoxel.camera import Cameras, image_rays, sizes_of, stacked
 from univoxel.cli import main
 from univoxel.cli.detail import made_after_training, minutes_left, write
 from univoxel.cli.report import report
 from univoxel.color import linear_to_srgb
 from univoxel.core.records import Surface
 from univoxel.data import Photos
+from univoxel.data.lens import shrink
 from univoxel.detail import texture
 from univoxel.detail import views as detail_views
 from univoxel.detail.texture import load_detail, make_detail, page_options, save_detail
-from univoxel.detail.views import DetailedViews, coherence, likenesses
+from univoxel.detail.views import DetailedViews, coherence, likenesses, measure_full_size
 from univoxel.errors import DataError
 from univoxel.evaluation.measures import render_layers
 from univoxel.output.mesh import bake
@@ -135,6 +136,28 @@ def test_novel_views_show_it(scene, photos, detail):
         assert found is not None
         assert coherence([found])[1] > 0.85
         assert found.psnr > before.psnr + 3
+
+
+def test_full_size_is_that_of_each_file(scene, photos, detail):
+    """Files of differing sizes, of which rows and columns are left over when they are shrunk."""
+    few, factor = photos.of(torch.arange(4)), 7
+    parts = [slice(SIZE - 7 * (view % 2)) for view in range(4)]  # cut off to the right and below
+    files = [photos.color[view, part, part] for view, part in enumerate(parts)]
+    masks = [photos.alpha[view, part, part, None] for view, part in enumerate(parts)]
+    color, alpha = ([shrink(x.float(), factor).byte() for x in xs] for xs in (files, masks))
+    sizes = sizes_of([(x.shape[1], x.shape[0]) for x in color])
+    lens = few.cameras.focal / factor, few.cameras.centre / factor
+    small = replace(
+        few,
+        color=stacked(color),
+        alpha=stacked(alpha)[..., 0],
+        cameras=Cameras(few.cameras.camera_to_world, *lens, *sizes),
+        downscale=factor,
+        readers=tuple(lambda _, file=file: file for file in files),
+    )
+    found = measure_full_size(scene, DetailedViews(scene, detail, small), small)
+    assert found["full_coherence_2"] > 0.85
+    assert found["full_psnr"] > 30
 
 
 def test_what_is_no_object_in_a_photograph_nearby_does_not_count(scene, photos, detail):

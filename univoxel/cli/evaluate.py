@@ -146,7 +146,7 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
         "model_bytes": (run / FILE).stat().st_size,
     }
     if asked.full_size:
-        result |= measure_full_size(scene, detailed, photos, save)
+        result |= measure_full_size(scene, detailed, photos, save, asked.fit_light)
     figures = views.say_trust(surveyed, report.get("troubles", []), save)
     if json:
         verdict = load_verdict(run)

@@ -43,7 +43,7 @@ from univoxel.detail.texture import (
     vertices_of,
 )
 from univoxel.errors import UserError
-from univoxel.evaluation.measures import render_layers
+from univoxel.evaluation.measures import fit_light_, render_layers
 from univoxel.ops import native
 from univoxel.ops.charts import between, corner_weights, linear, sampled
 from univoxel.render.metrics import ssim
@@ -64,9 +64,10 @@ KEPT = 8  # photographs in memory, 36 MB each where they have 12 megapixels
 
 @dataclass(frozen=True)
 class _Photo:
-    """What one photograph says, at its own size."""
+    """What one photograph says."""
 
-    picture: Tensor  # [H, W, 3] as stored
+    picture: Tensor  # [H, W, 3] as stored, or linear
+    scale: float  # its size over that of the file, at most 1
     values: Tensor  # [P, 7] A, B and weight at the vertices
     shown: Tensor  # [F] bool: faces none of whose corners are hidden
 
@@ -85,8 +86,7 @@ class DetailedViews:
             self.photos = scene.registered(photos)
         self._kept: OrderedDict[int, _Photo] = OrderedDict()
         if self.photos is not None:
-            width = self.photos.readers[0](1).shape[1]
-            self.full: Cameras = resize(self.photos.cameras, width)
+            self.full: Cameras = full_size(self.photos)
             self._scale = 1.0  # of the photographs that are kept
 
     @torch.no_grad()
@@ -176,22 +176,21 @@ class DetailedViews:
             towards = normalize(self.full.camera_to_world[view, :, 3] - some, dim=1)
             cosine = -(towards * direction[seen]).sum(1)
             weight = (at[:, 6] * (NARROW * (cosine - 1)).exp())[:, None]
-            size = torch.tensor([photo.picture.shape[1], photo.picture.shape[0]])
-            pixel = project(self.full, view, some)[0] * size / torch.tensor(self.full.size(view))
-            color = sampled(photo.picture, pixel)
+            pixel = project(self.full, view, some)[0]
+            color = sampled(photo.picture, photo.scale * pixel)
             ratio = (color + DARK) / (at[:, :3] * albedo[seen] + at[:, 3:6] + DARK)
             # Where the surface is off, or a part was moved, it may show what is behind the object
-            weight = weight * self._shown(view, pixel / size)[:, None]
+            weight = weight * self._shown(view, pixel)[:, None]
             total.index_add_(0, seen, weight * ratio.clamp(1 / MOST, MOST).log())
             whole.index_add_(0, seen, weight)
         return total / whole
 
-    def _shown(self, view: int, place: Tensor) -> Tensor:
-        """Whether a photograph's mask has the object at places [N, 2], each in [0, 1]: [N]."""
+    def _shown(self, view: int, pixel: Tensor) -> Tensor:
+        """Whether a photograph's mask has the object at points of its full size [N, 2]: [N]."""
         assert self.photos is not None
         _, alpha = self.photos.stored(view)
         height, width = alpha.shape
-        column, row = (place * torch.tensor([width, height])).long().unbind(1)
+        column, row = (pixel / self.photos.downscale).long().unbind(1)
         at = alpha[row.clamp(0, height - 1), column.clamp(0, width - 1)]
         return coverage_of(at)
 
@@ -214,11 +213,12 @@ class DetailedViews:
             finally:
                 self.scene.views = shown
             values[:, 6] = quality / quality.max().clamp_min(1e-30)
-            picture = self.photos.readers[view](1)
+            picture, scale = self.photos.readers[view](1), 1.0
             if self._scale < 1 - SAME:
-                picture = _shrunk(picture, self._scale)
+                scale = self._scale
+                picture = _shrunk(picture, scale)
             shown = seen[self.detail.faces.long()].all(1)
-            self._kept[view] = _Photo(picture, values, shown)
+            self._kept[view] = _Photo(picture, scale, values, shown)
         self._kept.move_to_end(view)
         return self._kept[view]
 
@@ -244,6 +244,12 @@ def detailed_views(scene: Scene, run: Path, data: Path | None) -> DetailedViews 
     except (UserError, OSError) as error:
         log.info("novel views use only the model, not the training photographs: %s", error)
         return DetailedViews(scene, detail)
+
+
+def full_size(photos: Photos) -> Cameras:
+    """The cameras of photographs at the size of their files, but for the rows and columns that are
+    cut off to the right and below because `Photos.downscale` does not divide them."""
+    return resize(photos.cameras, photos.downscale * photos.cameras.width)
 
 
 def _shrunk(picture: Tensor, scale: float) -> Tensor:
@@ -321,27 +327,34 @@ def coherence(found: list[Likeness]) -> list[float]:
 
 @torch.no_grad()
 def measure_full_size(
-    scene: Scene, views: DetailedViews | None, test: Photos, save: Path | None
+    scene: Scene,
+    views: DetailedViews | None,
+    test: Photos,
+    save: Path | None = None,
+    fit_light: bool = False,
 ) -> dict[str, float | None]:
     """Novel views at the size of their photographs' files against these, by `FULL_MEASURES`.
 
     Args:
         views: None: the model's views, enlarged.
+        fit_light: each is rendered in the light that fits its photograph.
         save: folder for NAME_full.exr, the view as half floats: rgb.*, linear on black, and alpha.
     """
     found: tuple[list[Likeness], list[Likeness]] = ([], [])
     similar: list[float] = []
+    cameras = full_size(test)
     for view in track(range(len(test) if test.readers else 0), "full size"):
-        photo = linear(test.readers[view](1))
-        cameras = resize(test.cameras.of(torch.tensor([view])), photo.shape[1])
+        width, height = cameras.size(view)
+        photo = linear(test.readers[view](1)[:height, :width])
+        if fit_light:
+            fit_light_(scene, test, view, views and views.detail.near)
         layers = render_layers(scene, test.cameras, view)
-        height, width = photo.shape[:2]
         cover = _enlarged(test.picture(view)[1][..., None], width, height)[..., 0]
         alpha = _enlarged(layers.alpha[..., None], width, height)[..., 0]
         if views is None:
             aided = alone = _enlarged(layers.rgb, width, height)
         else:
-            aided, alone = views.render(cameras, 0, layers.rgb, layers.alpha)
+            aided, alone = views.render(cameras, view, layers.rgb, layers.alpha)
         both = torch.minimum(cover, alpha)
         like = likenesses((aided, alone), photo, both)  # none, if little of the object is seen
         for measured, one in zip(found, like, strict=False):
