@@ -47,6 +47,20 @@ def test_albedo_shifts_as_a_whole():
         assert torch.equal(a, b)
 
 
+def test_roughness_shifts_as_a_whole():
+    head, features = MaterialHead(4, 8), torch.randn(101, 6)
+    before = head(features)
+    head.shift_roughness(features, 0.7)
+    after = head(features)
+    torch.testing.assert_close(after[1].median(), torch.tensor(0.7))
+    assert (after[1][before[1].argsort()].diff() > -1e-6).all()
+    assert torch.equal(after[0], before[0])
+    assert torch.equal(after[2], before[2])
+    known = MaterialHead(4, 8, roughness=0.4)
+    known.shift_roughness(features, 0.7)
+    assert (known(features)[1] == 0.4).all()
+
+
 def test_materials_see_their_channels_only():
     head, features = MaterialHead(4, 8), torch.randn(10, 6)
     others = torch.cat([features[:, :4], torch.randn(10, 2)], 1)

@@ -10,6 +10,7 @@ from observed_points import (
     RED,
     Steps,
     lamps,
+    no_metal,
     photographed,
     photographs_under,
     problem_on_a_sphere,
@@ -307,6 +308,27 @@ def test_training_says_and_keeps_that_there_is_nothing_but_metal(events, monkeyp
     told = Steps(4)
     events(told, only_metal=True)
     assert not told.said  # it was asked for
+
+
+def test_the_solve_starts_glossy(monkeypatch):
+    scene, problem = sphere_of((0.5, 0.5, 0.5), 0.6, 0.6)
+    monkeypatch.setattr(joint_solve, "initialise_", lambda s, p, decisions, *_: (decisions, []))
+    labels, cfg = no_metal(problem), replace(CFG, colors=False)
+    joint_solve.start_(scene, problem, labels, cfg, 1.0, Steps(1))
+    roughness = scene.material(scene.field.features_at(problem.observations.position))[1]
+    assert roughness.median().item() == pytest.approx(joint_solve.GLOSSY)
+
+
+def test_roughness_follows_newtons_points():
+    """By what they changed, not to where they are: they are some of the points."""
+    scene, problem = sphere_of((0.4, 0.3, 0.2), 0.4, 0.4)
+    features = scene.field.features_at(problem.observations.position)
+    before = [m.detach() for m in scene.material(features)]
+    joint_solve.follow_(scene, problem, NewtonRound([1.0], to_roughness=0.2))
+    albedo, roughness, metallic = scene.material(features)
+    torch.testing.assert_close(roughness.median(), before[1].median() + 0.2)
+    assert torch.equal(albedo, before[0])
+    assert torch.equal(metallic, before[2])
 
 
 def test_materials_follow_a_map_that_was_changed(monkeypatch):

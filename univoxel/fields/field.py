@@ -56,6 +56,16 @@ class MaterialHead(nn.Module):
         wanted, now = torch.logit(medians, eps=1e-4)
         self.net.linear[-1].bias[:3] += wanted - now
 
+    @torch.no_grad()
+    def shift_roughness(self, features: Tensor, median: float) -> None:
+        """Make everything rougher or glossier, to that median over features [N, C]; what is known
+        stays."""
+        if self.roughness is None:
+            medians = torch.stack([torch.tensor(median), self(features)[1].median()])
+            low = self.min_roughness
+            wanted, now = torch.logit((medians - low) / (1 - low), eps=1e-4)
+            self.net.linear[-1].bias[3] += wanted - now
+
 
 class RadianceHead(nn.Module):
     """Outgoing radiance without any model of light: it lets geometry converge early.

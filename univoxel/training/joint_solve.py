@@ -80,6 +80,9 @@ ALBEDO_SMOOTHNESS = 0.005
 ROUGHNESS_SMOOTHNESS = 0.02
 # Weight of the cross entropy of metallic and the metal classification
 METALLIC_WEIGHT = 0.01
+# Median roughness that the solve starts with. What is rough becomes so, but for what starts rough
+# the map makes itself sharp and bright enough, and both fit nearly as well
+GLOSSY = 0.25
 # Mean luminance of an ordinary albedo, and the brightest channel of an ordinary metal (steel). The
 # former counts as much as photographs whose `NewtonRound.level` is LEVEL: on the bank's tuning
 # half, the level is 2e-4 to 4e-4 for rough objects and 5e-3 for glossy ones
@@ -196,6 +199,7 @@ def newton_phase_(
         newton = newton_round_(scene, problem, decisions, cfg, seconds)
         for trouble in newton.troubles:
             progress.trouble(trouble)
+        follow_(scene, problem, newton)
         if cfg.colors:
             minimise_entropy_(scene, problem, decisions)
         done = rounds_done(cfg, rounds_left - 1)
@@ -206,6 +210,18 @@ def newton_phase_(
         if decisions.mirrors is not None:
             teach_mirrors_(scene, problem, decisions.mirrors, cfg)
     return decisions, newton
+
+
+@torch.no_grad()
+def follow_(scene: Scene, problem: JointProblem, newton: NewtonRound) -> None:
+    """Shift all roughnesses as the median of Newton's points changed with the map.
+
+    Newton leaves the materials. Under a map that belongs to glossier ones Adam would roughen
+    everything before albedos have followed, and roughness does not come back from 1.
+    """
+    features = scene.field.features_at(problem.observations.position)
+    median = float(scene.material(features)[1].median())
+    scene.material.shift_roughness(features, median + newton.to_roughness)
 
 
 @torch.no_grad()
@@ -280,6 +296,8 @@ def start_(
     Args:
         seconds: that the trials may take.
     """
+    features = scene.field.features_at(problem.observations.position)
+    scene.material.shift_roughness(features, GLOSSY)
     decisions, troubles = initialise_(scene, problem, decisions, cfg, seconds)
     for trouble in troubles:
         progress.trouble(trouble)

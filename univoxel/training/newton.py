@@ -68,6 +68,7 @@ class NewtonRound:
     costs: list[float] = field(default_factory=list)  # mean weighted squared residual by step
     unseen: float = math.inf  # mean robust cost of observations that were not used; inf: of none
     level: float = 0.0  # second derivative of the cost by the log brightness of the whole map
+    to_roughness: float = 0.0  # what the points' median roughness changed by, as the map did
     troubles: list[str] = field(default_factory=list)  # sentences about what had no solution
 
 
@@ -182,9 +183,9 @@ def newton_round_(
             return NewtonRound(costs, troubles=[UNSOLVABLE])
         costs.append(made[0])
         level = made[1]
-    if unseen is None:
-        return NewtonRound(costs, level=level)
-    return NewtonRound(costs, unseen_cost(scene, points, unseen), level)
+    to_roughness = float(points.roughness.median() - points.prior_roughness.median())
+    left = math.inf if unseen is None else unseen_cost(scene, points, unseen)
+    return NewtonRound(costs, left, level, to_roughness)
 
 
 def unseen_cost(scene: Scene, points: NewtonPoints, unseen: JointProblem) -> float:
