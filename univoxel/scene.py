@@ -25,8 +25,7 @@ from univoxel.data import Photos
 from univoxel.errors import ConfigError, DataError, FileError, MissingFile, UserError
 from univoxel.fields.bricks import BrickDistances, pack_bricks, unpack_bricks
 from univoxel.fields.distances import PACKED, DenseDistances, SurfaceVersion, pack, unpack
-from univoxel.fields.features import HashFeatures, Levels, NodeFeatures
-from univoxel.fields.field import Field, MaterialHead, RadianceHead
+from univoxel.fields.field import Field, HashField, Levels, MaterialHead, NodeField, RadianceHead
 from univoxel.fields.grid import GridShape
 from univoxel.lights.base import MOST_ROWS, MirroredLight
 from univoxel.lights.latlong import DistantLight
@@ -254,7 +253,7 @@ def stored(scene: Scene, slim: bool = False, reach: float | None = None) -> dict
         sdf = tensors["field.sdf"] = sdf[: Bricks.NODES * bricks.count]
     # Features that no sample has touched are 0: only the others are stored.
     features = scene.field.features.detach().flatten(0, -2)
-    if isinstance(scene.field.encoding, NodeFeatures):
+    if isinstance(scene.field, NodeField):
         features = features[: sdf.numel()]
     touched = features.any(1)
     if slim:
@@ -300,8 +299,8 @@ def save_scene(
         "inv_s": scene.inv_s,
         "state": state,
     }
-    if isinstance(scene.field.encoding, HashFeatures):
-        meta["levels"] = astuple(scene.field.encoding.levels)
+    if isinstance(scene.field, HashField):
+        meta["levels"] = astuple(scene.field.levels)
     path = run / FILE
     try:
         with replacing(path) as temporary:
@@ -451,10 +450,9 @@ def _scene(about: Description, bricks: Bricks | None) -> Scene:
     """A scene as described, its values yet unknown."""
     distances = DenseDistances(about.grid) if bricks is None else BrickDistances(about.grid, bricks)
     if about.levels:
-        encoding = HashFeatures(about.levels)
+        field = HashField(distances, about.levels)
     else:
-        encoding = NodeFeatures(torch.zeros(*distances.sdf.shape, about.scene.channels))
-    field = Field(distances, encoding)
+        field = NodeField(distances, torch.zeros(*distances.sdf.shape, about.scene.channels))
     if field.channels != about.scene.channels:
         raise ValueError(
             f"the field has {field.channels} channels, but the networks use {about.scene.channels}"

@@ -24,8 +24,7 @@ from univoxel.data import Photos, keep_photos, load_photos
 from univoxel.data.path_sandbox import FEWEST
 from univoxel.errors import Cancelled, DataError, ExistingFile, UserError
 from univoxel.evaluation.confidence import REPORT_POINTS, Survey, numbers, survey, words
-from univoxel.fields.features import PER_LEVEL, Levels
-from univoxel.fields.field import Field, dense_field, hash_field
+from univoxel.fields.field import PER_LEVEL, Field, Levels, dense_field, hash_field
 from univoxel.fields.grid import fit_grid
 from univoxel.ops import native
 from univoxel.output.timelapse import Timelapse
