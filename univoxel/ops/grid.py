@@ -12,7 +12,7 @@ from torch import Tensor
 
 from univoxel.core.records import Bricks
 from univoxel.ops import native
-from univoxel.ops.differentiable import Differentiable, check, check_bricks, differentiable
+from univoxel.ops.differentiable import check, check_numbers, differentiable
 
 # What the sampling of dense and of sparse grids shares.
 #
@@ -30,8 +30,7 @@ def check_place(op: str, points: int, origin: Sequence[float], voxel_size: float
         raise ValueError(f"{op}: points must be fewer than 2^31, got {points}")
     if len(origin) != 3 or not all(math.isfinite(x) for x in origin):
         raise ValueError(f"{op}: origin must be 3 finite numbers, got {list(origin)}")
-    if not 0 < voxel_size < math.inf:
-        raise ValueError(f"{op}: voxel_size must be above 0, got {voxel_size}")
+    check_numbers(op, "above 0", voxel_size=voxel_size)
 
 
 class SparseGrad(torch.autograd.Function):
@@ -121,16 +120,15 @@ def _backward(
     return gradients(grid_of(table, *place), (sdf, features, points, order), grads, needs, sparse)
 
 
-def _sampled(
-    sdf: Tensor,
-    features: Tensor,
-    table: Tensor,
-    points: Tensor,
-    size: list[int],
-    origin: list[float],
-    voxel_size: float,
-    sparse_grad: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+@differentiable(
+    "sdf* features* table points*",
+    "int[] size, float[] origin, float voxel_size, bool sparse_grad",
+    outputs=4,
+    forward=_forward,
+    backward=_backward,
+    held=1,
+)
+def _sample_grid(sdf, features, table, points, *_):
     """Value, gradient, feature, and the points' order by tile, which backward uses again."""
     m = len(points)
     return (
@@ -139,12 +137,6 @@ def _sampled(
         features.new_empty(m, features.shape[-1]),
         points.new_empty(m, dtype=torch.int32),
     )
-
-
-def sampler(name: str) -> Differentiable:
-    """The op of that name. It is the same for both: a dense grid is one without a table."""
-    to = "sdf features points"
-    return differentiable(to, name=name, forward=_forward, backward=_backward, held=1)(_sampled)
 
 
 # Sampling of a dense grid: distance, its spatial gradient and features at points.
@@ -206,7 +198,7 @@ def sample_dense(
     if native.serves(sdf):
         tensors = (t.contiguous() for t in (sdf, features, no_table(sdf), points))
         place = list(sdf.shape), [float(x) for x in origin], float(voxel_size)
-        return _sample_dense(*tensors, *place, sparse_grad)[:3]
+        return _sample_grid(*tensors, *place, sparse_grad)[:3]
     if sparse_grad:
         sdf, features = SparseGrad.apply(sdf, 3), SparseGrad.apply(features, 3)
     return sample_dense_reference(sdf, features, points, origin, voxel_size)
@@ -239,9 +231,6 @@ def sample_dense_reference(
         gradient = gradient + weight[:, None] * slope
     value = torch.where(lost[:, 0], torch.nan, value)
     return value, torch.where(lost, torch.nan, gradient), torch.where(lost, torch.nan, feature)
-
-
-_sample_dense = sampler("sample_dense")
 
 
 # Sampling of a grid of which only bricks around a surface are stored.
@@ -280,17 +269,17 @@ def sample_sparse(
     Differentiable in: sdf, features, points. Second order raises.
     Source: bricks over a table, as in Museth 2013 (VDB) with one level.
     """
-    check_bricks("sample_sparse", bricks, sdf=(sdf, "R"), features=(features, "R C"))
-    sizes = check(
-        "sample_sparse", sdf=(sdf, "R"), features=(features, "R C"), points=(points, "M 3")
-    )
+    if bricks is None:
+        raise TypeError("sample_sparse: bricks must be of the type Bricks, got NoneType")
+    tensors = {"sdf": (sdf, "R"), "features": (features, "R C"), "points": (points, "M 3")}
+    sizes = check("sample_sparse", bricks, **tensors)
     if not bricks.table.numel():
         raise ValueError(f"sample_sparse: bricks must not be empty, got size {list(bricks.size)}")
     check_place("sample_sparse", sizes["M"], origin, voxel_size)
     if native.serves(sdf):
         tensors = (t.contiguous() for t in (sdf, features, bricks.table, points))
         place = list(bricks.size), [float(x) for x in origin], float(voxel_size)
-        return _sample_sparse(*tensors, *place, sparse_grad)[:3]
+        return _sample_grid(*tensors, *place, sparse_grad)[:3]
     if sparse_grad:
         sdf, features = SparseGrad.apply(sdf, 1), SparseGrad.apply(features, 1)
     return sample_sparse_reference(sdf, features, bricks, points, origin, voxel_size)
@@ -310,6 +299,3 @@ def sample_sparse_reference(
     whole = torch.where(stored, sdf[rows], sdf.detach()[rows])
     of_nodes = torch.where(stored[..., None], features[rows], features.detach()[rows])
     return sample_dense_reference(whole, of_nodes, points, origin, voxel_size)
-
-
-_sample_sparse = sampler("sample_sparse")

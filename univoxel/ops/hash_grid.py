@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from univoxel.ops import native
-from univoxel.ops.differentiable import check, differentiable
+from univoxel.ops.differentiable import check, check_numbers, differentiable
 from univoxel.ops.grid import SparseGrad
 
 PRIMES = (1, 2654435761, 805459861)
@@ -67,8 +67,7 @@ def encode_hash(
     levels = len(voxel_sizes)
     place = ([float(x) for x in lower], [float(x) for x in upper], [float(h) for h in voxel_sizes])
     felt = levels if felt is None else min(felt, levels)
-    if felt < 0:
-        raise ValueError(f"encode_hash: felt must be at least 0, got {felt}")
+    check_numbers("encode_hash", "at least 0", felt=felt)
     if native.serves(table):
         return _encode_hash(table.contiguous(), points.contiguous(), *place, sparse_grad, felt)
     if sparse_grad:
@@ -251,14 +250,11 @@ def _backward(
     return gradients(table, points, grads[0], place, felt, needs, sparse)
 
 
-@differentiable(to="table points", forward=_forward, backward=_backward)
-def _encode_hash(
-    table: Tensor,
-    points: Tensor,
-    lower: list[float],
-    upper: list[float],
-    voxel_sizes: list[float],
-    sparse_grad: bool,
-    felt: int,
-) -> Tensor:
+@differentiable(
+    "table* points*",
+    "float[] lower, float[] upper, float[] voxel_sizes, bool sparse_grad, int felt",
+    forward=_forward,
+    backward=_backward,
+)
+def _encode_hash(table, points, lower, upper, voxel_sizes, *_):
     return points.new_empty(len(points), len(voxel_sizes) * table.shape[1])

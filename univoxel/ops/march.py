@@ -9,7 +9,7 @@ from torch import Tensor
 
 from univoxel.core.records import Bricks, Samples
 from univoxel.ops import native
-from univoxel.ops.differentiable import check, check_bricks
+from univoxel.ops.differentiable import check, check_numbers
 
 BRICK = 4  # voxels along the side of a brick that is skipped as a whole; as kBrick in csrc/nodes.h
 
@@ -48,7 +48,7 @@ def brick_minimum(sdf: Tensor, bricks: Bricks | None = None) -> Tensor:
 
 
 def _sparse_brick_minimum(sdf: Tensor, bricks: Bricks) -> Tensor:
-    check_bricks("brick_minimum", bricks, sdf=(sdf, "R"))
+    check("brick_minimum", bricks, sdf=(sdf, "R"))
     n = len(bricks.place)
     if native.serves(sdf):
         out = sdf.new_empty(n)
@@ -113,22 +113,17 @@ def march(
 
     Not differentiable. Source: Wang et al. 2021 (NeuS), eq. 13.
     """
-    if bricks is not None:
-        check_bricks("march", bricks, sdf=(sdf, "R"), brick_min=(brick_min, "n"))
     check(
         "march",
+        bricks,
         sdf=(sdf, "X Y Z" if bricks is None else "R"),
         brick_min=(brick_min, "A B C" if bricks is None else "n"),
         origin=(origin, "N 3"),
         direction=(direction, "N 3"),
         jitter=(jitter, "N"),
     )
-    for name, number in (("voxel_size", voxel_size), ("step", step), ("inv_s", inv_s)):
-        if not 0 < number < float("inf"):
-            raise ValueError(f"march: {name} must be positive and finite, got {number}")
-    for name, number in (("min_weight", min_weight), ("early_stop", early_stop)):
-        if not 0 <= number <= 1:
-            raise ValueError(f"march: {name} must be in [0, 1], got {number}")
+    check_numbers("march", "above 0", voxel_size=voxel_size, step=step, inv_s=inv_s)
+    check_numbers("march", "in [0, 1]", min_weight=min_weight, early_stop=early_stop)
     if not native.serves(sdf):
         return march_reference(
             sdf if bricks is None else sdf[bricks.grid_rows()],

@@ -83,8 +83,8 @@ def _backward(
     return [of_x, *(of_layers or [None] * (2 * n))]
 
 
-@differentiable(to="x weights biases", forward=_forward, backward=_backward)
-def _mlp(x: Tensor, weights: list[Tensor], biases: list[Tensor]) -> Tensor:
+@differentiable("x* weights*[] biases*[]", forward=_forward, backward=_backward)
+def _mlp(x, weights, biases):
     return x.new_empty(len(x), len(biases[-1]))
 
 

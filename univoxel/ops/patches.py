@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from univoxel.ops import native
-from univoxel.ops.differentiable import check, differentiable
+from univoxel.ops.differentiable import check, check_numbers, differentiable
 
 NEAREST = 1e-6  # along the axis of a view: what lies before it is not seen
 
@@ -79,8 +79,7 @@ def patch_correlation(
             f"patch_correlation: brightness must have at least 2 rows and columns, "
             f"got {list(brightness.shape)}"
         )
-    if not 0 < noise < math.inf:
-        raise ValueError(f"patch_correlation: noise must be above 0, got {noise}")
+    check_numbers("patch_correlation", "above 0", noise=noise)
     tensors = (brightness, projection, origin, direction, own, views, position, normal)
     if not native.serves(position):
         return patch_correlation_reference(*tensors, noise)
@@ -153,18 +152,16 @@ def _backward(
     return (grads[0][..., None] * saved[0]).sum(1).split(3, 1)
 
 
-@differentiable(to="position normal", forward=_forward, backward=_backward, held=1, traced=True)
-def _patch_correlation(
-    brightness: Tensor,
-    projection: Tensor,
-    origin: Tensor,
-    direction: Tensor,
-    own: Tensor,
-    views: Tensor,
-    position: Tensor,
-    normal: Tensor,
-    noise: float,
-) -> tuple[Tensor, Tensor, Tensor]:
+@differentiable(
+    "brightness projection origin direction own views position* normal*",
+    "float noise",
+    outputs=3,
+    forward=_forward,
+    backward=_backward,
+    held=1,
+    traced=True,
+)
+def _patch_correlation(brightness, projection, origin, direction, own, views, position, *_):
     """Correlation, whether all is seen, and the derivative to position and normal."""
     n, k = views.shape
     seen = torch.empty(n, k, dtype=torch.bool, device=position.device)
