@@ -536,7 +536,8 @@ def advise(
         gains.append(float(gain[best]))
         straight = straight + shown[best]
         nearest = torch.minimum(nearest, _degrees(weighed, weighed[best : best + 1])[:, 0])
-    front = _front(taken)
+    # The first photograph that was taken from a side; argmax of none is the first of all
+    front = int((elevations(taken).abs() < STEEP).int().argmax())
     hidden = (surveyed.views == 0) & (shown.amax(0) == 0)
     return Advice(
         taken=taken,
@@ -570,12 +571,6 @@ def _shown(surveyed: Survey, surface: VisibilityScene, eye: Tensor) -> Tensor:
 def _degrees(a: Tensor, b: Tensor) -> Tensor:
     """Angles [A, B] between unit vectors [A, 3] and [B, 3]."""
     return (a @ b.T).clamp(-1, 1).acos().rad2deg()
-
-
-def _front(taken: Tensor) -> int:
-    """The first photograph that was taken from a side."""
-    flat = (elevations(taken).abs() < STEEP).nonzero()[:, 0]
-    return int(flat[0]) if len(flat) else 0
 
 
 def azimuths(direction: Tensor) -> Tensor:

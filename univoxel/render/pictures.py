@@ -172,11 +172,7 @@ def shrunk(photos: Photos, view: int, width: int, height: int) -> Tensor:
 def preview(
     scene: Scene, photos: Photos, path: Path, view: int = 0, albedo_near: AlbedoNear | None = None
 ) -> None:
-    """One photograph beside what the scene says of it: photo, render, albedo, roughness, normal.
-
-    Args:
-        albedo_near: what gives the albedo, in place of the field.
-    """
+    """One photograph beside what the scene says of it: photo, render, albedo, roughness, normal."""
     width, height = photos.cameras.size(view)
     surface, wo = surface_of_view(scene, photos.cameras, view, albedo_near)
     color, alpha = photos.picture(view)

@@ -194,11 +194,7 @@ def shade_hits(scene: Scene, surface: Surface, wo: Tensor, view: int | None = No
 def surface_of_view(
     scene: Scene, cameras: Cameras, view: int, albedo_near: AlbedoNear | None = None
 ) -> tuple[Surface, Tensor]:
-    """Surface at every pixel of a view, row by row [H * W], and wo [H * W, 3].
-
-    Args:
-        albedo_near: what gives the albedo, in place of the field.
-    """
+    """Surface at every pixel of a view, row by row [H * W], and wo [H * W, 3]."""
     rays = image_rays(cameras, view)
     parts = [
         surface_at(scene, Rays(o, d))
