@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from univoxel.cli.parsing import DataOf, Run, takes, written
 from univoxel.core import log
 from univoxel.core.choices import Detailing
-from univoxel.errors import UserError
+from univoxel.errors import UserError, demand
 
 if TYPE_CHECKING:
     from univoxel.data import Photos
@@ -38,11 +38,9 @@ class DetailOptions:
     """width of the square texture, a power of 2 from 256 to 8192"""
 
     def __post_init__(self) -> None:
-        low, high = DETAIL_SIZES
-        if self.size is not None and (not low <= self.size <= high or self.size & (self.size - 1)):
-            raise UserError(
-                f"detail: size must be a power of 2 from {low} to {high}, got {self.size}", "size"
-            )
+        (low, high), size = DETAIL_SIZES, self.size
+        fits = size is None or (low <= size <= high and not size & (size - 1))
+        demand(fits, "size", f"a power of 2 from {low} to {high}", size)
 
 
 @takes(DetailOptions)

@@ -33,7 +33,7 @@ from typing import (
 )
 
 from univoxel.core.choices import Box, Downscale
-from univoxel.errors import UserError
+from univoxel.errors import demand
 
 # What a command returns is printed, if it is a file or several; a number is the exit code
 Result: TypeAlias = int | Path | Sequence[Path] | None
@@ -384,14 +384,12 @@ def json_file(asked: File | None) -> Iterator[File | None]:
 
 def check_minutes(minutes: float | None) -> None:
     """Refuse, by a UserError, a limit that is not above 0."""
-    if minutes is not None and not minutes > 0:
-        raise UserError(f"minutes must be above 0, got {minutes:g}", "minutes")
+    demand(minutes is None or minutes > 0, "minutes", "above 0", minutes)
 
 
 def check_downscale(downscale: Downscale) -> int:
     """The side of the squares of pixels that become one, 0 for auto; a UserError below 1."""
     if downscale == "auto":
         return 0
-    if downscale < 1:
-        raise UserError(f"downscale must be at least 1, got {downscale}", "downscale")
+    demand(downscale >= 1, "downscale", "at least 1", downscale)
     return downscale

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from univoxel.cli.parsing import ADVANCED, Run, takes, written
 from univoxel.core.choices import BOUNCES, ELEVATION, SAMPLES, Animation, Background, Ground
-from univoxel.errors import UserError
+from univoxel.errors import UserError, demand
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -79,12 +79,9 @@ class RelightOptions:
     """background of the images"""
 
     def __post_init__(self) -> None:
-        if not math.isfinite(self.rotate):
-            raise UserError(f"relight: rotate must be finite, got {self.rotate}", "rotate")
-        if not 0 <= self.exposure < math.inf:
-            raise UserError(
-                f"relight: exposure must be finite and at least 0, got {self.exposure}", "exposure"
-            )
+        demand(math.isfinite(self.rotate), "rotate", "finite", self.rotate)
+        bright = 0 <= self.exposure < math.inf
+        demand(bright, "exposure", "finite and at least 0", self.exposure)
 
     def quality(self) -> Quality:
         """How a frame is rendered; a ground at the lowest point is left to the mesh. Numbers out of
