@@ -241,9 +241,6 @@ def save_config(cfg: TrainConfig) -> None:
     """Write the resolved configuration to config.json in the run's folder, atomically.
 
     The version of the package comes first, because it determines all other constants.
-
-    Raises:
-        OSError: it cannot be written.
     """
     values = {"version": __version__} | dataclasses.asdict(cfg)
     write_json(cfg.out / "config.json", values)
@@ -272,11 +269,7 @@ def load_config(path: Path) -> TrainConfig:
 
 
 def check_same(cfg: TrainConfig) -> None:
-    """Refuse to resume the run in cfg.out with other stages or another model.
-
-    Raises:
-        UserError: they differ, or config.json cannot be read.
-    """
+    """Refuse, by a UserError, to resume the run in cfg.out with other stages or another model."""
     path = cfg.out / "config.json"
     try:
         before = load_config(path)

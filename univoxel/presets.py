@@ -119,11 +119,8 @@ def with_field(cfg: TrainConfig, kind: FieldName) -> TrainConfig:
 
 
 def with_metal(cfg: TrainConfig, metal: Metal) -> TrainConfig:
-    """The same configuration, given whether the object is all metal.
-
-    Raises:
-        UserError: it is, but no stage solves for an environment map.
-    """
+    """The same configuration, given whether the object is all metal; a UserError if it is, but no
+    stage solves for an environment map."""
     if metal == "auto":
         return cfg
     if not any(isinstance(s, JointConfig) for s in cfg.stages):

@@ -61,22 +61,15 @@ WORLD = "world.json"  # in the folder of a run whose world is not that of its da
 
 
 def save_world(moved: np.ndarray | None, run: Path) -> None:
-    """Write the transform from the world of the data's files to that of the run, as in `Photos`.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write the transform from the world of the data's files to that of the run, as in `Photos`."""
     (run / WORLD).unlink(missing_ok=True)
     if moved is not None:
         write_json(run / WORLD, {"from_data": moved.tolist()})
 
 
 def load_world(run: Path) -> np.ndarray | None:
-    """[3, 4], as in `Photos.moved`; None also of runs of earlier versions, which kept none.
-
-    Raises:
-        DataError: the file cannot be read.
-    """
+    """[3, 4], as in `Photos.moved`; None also of runs of earlier versions, which kept none. A
+    DataError if the file cannot be read."""
     path = run / WORLD
     if not path.is_file():
         return None
@@ -229,11 +222,7 @@ def judge(evidence: Evidence) -> Verdict:
 
 
 def save_verdict(verdict: Verdict, run: Path) -> None:
-    """Write the verdict to verdict.json in the run's folder, whole or not at all.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write the verdict to verdict.json in the run's folder, whole or not at all."""
     write_json(run / FILE, as_json(verdict))
 
 

@@ -156,21 +156,15 @@ class Scene(nn.Module):
         return radiance if self.views is None else radiance * self.views.gain(view)
 
     def registered(self, photos: Photos) -> Photos:
-        """The photographs that it was trained on, their cameras where they are believed to be.
-
-        Raises:
-            ValueError: other photographs, where cameras are refined.
-        """
+        """The photographs that it was trained on, their cameras where they are believed to be; a
+        UserError for others, where cameras are refined."""
         if self.poses is None:
             return photos
         return replace(photos, cameras=self.poses.corrected(photos.cameras))
 
     def show_light_of(self, view: str | None) -> None:
-        """Choose the photograph, by name or number, whose light is used; None: the mean of all.
-
-        Raises:
-            ValueError: there is no such photograph, or the scene has one light for all.
-        """
+        """Choose the photograph, by name or number, whose light is used; None: the mean of all. A
+        UserError if there is no such photograph, or one light for all."""
         if self.views is not None:
             self.views.choose(view)
         elif view is not None:
@@ -183,10 +177,7 @@ class Scene(nn.Module):
 
     def occluder(self) -> VisibilityScene:
         """The present surface, ready for rays; within `surface_held`, the one that is held.
-
-        Raises:
-            ValueError: the scene has no surface.
-        """
+        NoSurface if there is none."""
         if self._traced is not None:
             tracer, version = self._traced
             if self._held or version.holds(self.field.sdf):

@@ -24,11 +24,7 @@ MOST_OF_LIMIT = 0.25  # of the minutes that a training has
 
 @dataclass(frozen=True)
 class DetailOptions:
-    """Photographs and size of the texture.
-
-    Raises:
-        UserError: size out of range.
-    """
+    """Photographs and size of the texture; a UserError for a size out of range."""
 
     run: Run
     """folder of a trained run"""
@@ -106,11 +102,7 @@ def seconds_for(photos: Photos, detail: Detailing, threads: int) -> float:
 def made_after_training(
     scene: Scene, photos: Photos, run: Path, detail: Detailing, until: float | None
 ) -> Path | None:
-    """`write`, where a configuration asks for it.
-
-    Args:
-        until: time of `time.monotonic` at which training must have ended; None: there is no limit.
-    """
+    """`write`, where a configuration asks for it and `time.monotonic` is not past `until`."""
     if detail == "none":
         return None
     if until is not None and time.monotonic() > until:

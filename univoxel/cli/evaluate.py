@@ -17,11 +17,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class EvaluateOptions:
-    """How a run is measured.
-
-    Raises:
-        UserError: samples or bounces out of range; both light_of and fit_light.
-    """
+    """How a run is measured; a UserError for an option out of range, or two that exclude each
+    other."""
 
     run: parsing.Run
     """folder of a trained run"""

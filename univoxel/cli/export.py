@@ -23,11 +23,7 @@ LEAST_FACES = 32  # of the coarsest level: with fewer no shape is left
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """How a surface becomes a file.
-
-    Raises:
-        UserError: an argument is out of range.
-    """
+    """How a surface becomes a file; a UserError for an option out of range."""
 
     run: Run
     """folder of a trained run"""

@@ -124,8 +124,7 @@ def parse(
     """The call that arguments ask for; None: help was asked for and printed.
 
     Args:
-        commands: by name.
-        prefix: what is before their names.
+        commands: by name, without the prefix.
 
     Raises:
         Usage: they make no command.
@@ -206,11 +205,8 @@ def documentation(command: Command) -> str:
 
 
 def meanings(record: type) -> dict[str, str]:
-    """What is under each field of a record, in one line; nothing if there is no source.
-
-    Args:
-        record: a class that is in one file with its bases.
-    """
+    """What is under each field of a record, in one line; nothing if there is no source. A record is
+    in one file with its bases."""
     try:
         tree = ast.parse(inspect.getsource(sys.modules[record.__module__]))
     except OSError:
@@ -332,11 +328,8 @@ def overview(title: str, groups: Mapping[str, Mapping[str, Command]], end: str) 
 
 
 def completion(shell: Shell, commands: Mapping[str, Command], lab: Mapping[str, Command]) -> str:
-    """The script that makes a shell complete commands, options and their choices.
-
-    Args:
-        lab: commands of the experiments; empty if they are not available.
-    """
+    """The script that makes a shell complete commands, those of the experiments if there are any,
+    options and their choices."""
 
     import tyro
     from tyro.conf import ConsolidateSubcommandArgs, FlagCreatePairsOff, OmitSubcommandPrefixes

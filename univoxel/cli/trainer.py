@@ -70,11 +70,8 @@ def train(
     Raises:
         MissingExtra: view without viser.
         MissingNative: the compiled extension is missing or was built without Embree.
-        DataError: input that cannot be used.
-        ExistingFile: cfg.out already contains a run and resume is False.
+        UserError: data, checkpoint or options cannot be used, or need more memory than there is.
         OSError: a file of the run cannot be written; what was there before stays.
-        UserError: with resume, the checkpoint cannot be read, or it belongs to another
-            configuration; or training needs more memory than there is; or the port is taken.
     """
     if not native.reference_asked():
         native.require_embree("train")  # now, and not minutes later
@@ -187,10 +184,7 @@ def ready(
 def build_scene(prepared: Prepared, cfg: config.TrainConfig) -> Scene:
     """A scene whose surface is the carved hull, with poses and gains as far as they are known.
 
-    Draws the first weights from torch's generator.
-
-    Raises:
-        UserError: cfg.budget_mb is too small for any such scene.
+    Draws the first weights from torch's generator. A UserError if cfg.budget_mb is too small.
     """
     silhouettes, varying = prepared.silhouettes, prepared.varying
     lower, upper = silhouettes.box
@@ -229,11 +223,8 @@ def build_field(prepared: Prepared, cfg: config.TrainConfig) -> Field:
 
 
 def resumed(cfg: config.TrainConfig) -> tuple[Scene, dict[str, Any]] | None:
-    """The scene that a run continues with, and its state; None if nothing was saved yet.
-
-    Raises:
-        UserError: the checkpoint cannot be read, or it belongs to another configuration.
-    """
+    """The scene that a run continues with, and its state; None if nothing was saved yet. A
+    UserError if the run cannot be read, or is of another configuration."""
     if not (cfg.out / FILE).is_file():
         log.info(f"{cfg.out}: nothing has been saved yet, so training starts from the beginning")
         return None

@@ -141,14 +141,8 @@ class Survey:
 
 @torch.no_grad()
 def survey(scene: Scene, photos: Photos, points: int) -> Survey:
-    """How well the training photographs determine points of the surface.
-
-    Args:
-        points: how many, >= 1, spread evenly.
-
-    Raises:
-        ValueError: the scene has no surface.
-    """
+    """How well the training photographs determine points of the surface, spread evenly; a
+    ValueError if the scene has none."""
     generator = torch.Generator().manual_seed(0)
     photos = scene.registered(photos)
     mesh, tracer, offset = extract_mesh(scene), scene.occluder(), scene.field.voxel_size
@@ -382,11 +376,8 @@ def numbers(surveyed: Survey) -> dict[str, float]:
 
 
 def words(figures: dict[str, float], troubles: list[str]) -> str:
-    """The figures as a paragraph; findings that do not apply are left out.
-
-    Args:
-        troubles: what went wrong in training, from its state.
-    """
+    """The figures as a paragraph, with what went wrong in training; findings that do not apply are
+    left out."""
     sentences = [
         f"Mean expected error of the surface: {figures['albedo_error']:.2f} for the albedo (in "
         f"sRGB), {figures['roughness_error']:.2f} for the roughness, {figures['normal_error']:.0f} "

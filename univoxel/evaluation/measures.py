@@ -207,11 +207,7 @@ class Expected:
 
 
 def load_scene_truth(photos: Photos) -> SceneTruth:
-    """The truth beside the test views.
-
-    Raises:
-        DataError: a file cannot be used, or has other pixels than the views.
-    """
+    """The truth beside the test views; a DataError for files that do not belong to them."""
     paths = relight_maps(photos.folder)
     relit = {name: load_relit(photos, name) for name in paths}
     points = load_points(photos.folder)
@@ -222,14 +218,11 @@ def load_scene_truth(photos: Photos) -> SceneTruth:
 def expected_view(
     photos: Photos, relit: dict[str, tuple[Tensor, Tensor]], view: int, background: Behind = "black"
 ) -> Expected:
-    """The truth of one test view.
+    """The truth of one test view; a DataError for files that do not belong to it.
 
     Args:
         relit: as in `SceneTruth`.
         background: what the photograph is composited on.
-
-    Raises:
-        DataError: a file cannot be used, or has other pixels than the views.
     """
     truth = view_truth(photos, view)
     color, alpha = photos.picture(view)
@@ -248,14 +241,12 @@ def expected_view(
 
 
 def every_nth(photos: Photos, trained: list[str], every: int) -> Photos:
-    """The first of every so many photographs, in order of the names of all.
+    """The first of every so many photographs, in order of the names of all; a UserError if
+    some were trained on, or none is left.
 
     Args:
         photos: that were kept for tests.
         trained: names of those that were trained on.
-
-    Raises:
-        UserError: some were trained on, or none is left.
     """
     demand(every >= 1, "test_every", "at least 1", every)
     chosen = sorted([*photos.names, *trained])[::every]

@@ -90,11 +90,8 @@ class ViewLights(nn.Module):
         return len(self.names)
 
     def choose(self, view: str | None) -> None:
-        """Show the light of a view, by name or number, where none is named; None: the mean light.
-
-        Raises:
-            UserError: no such view.
-        """
+        """Show the light of a view, by name or number, where none is named; None: the mean light. A
+        UserError if there is no such view."""
         self.chosen = None if view is None else view_number(self.names, view, "light_of")
 
     def add(self, to_gains: Tensor, to_weights: Tensor | None = None) -> Tensor:

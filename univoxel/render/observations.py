@@ -255,11 +255,7 @@ class MaterialLabels:
 @torch.no_grad()
 def build_problem(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> JointProblem:
     """The problem of a scene with a map: points of its surface, their observations, and what light
-    can reach them.
-
-    Raises:
-        NoSurface: there is no surface, or no photograph sees it.
-    """
+    can reach them. NoSurface if there is none, or no photograph sees it."""
     assert scene.sky is not None  # the configuration has seen to it
     generator = torch.Generator().manual_seed(seed)
     mesh = extract_mesh(scene)

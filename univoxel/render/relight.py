@@ -225,11 +225,7 @@ def _floor(
 
 @dataclass(frozen=True)
 class Quality:
-    """How a frame is made.
-
-    Raises:
-        UserError: a field is out of range.
-    """
+    """How a frame is made; a UserError for a field out of range."""
 
     samples: int = SAMPLES  # of the light, per pixel; >= 1
     noise: float | None = None  # instead: samples until `relight_until` finds less; > 0
