@@ -47,14 +47,10 @@ from univoxel.sphere import fibonacci_sphere, gaps, side_of
 POINTS = 20_000  # of the surface that evaluation surveys, for its maps of expected errors
 REPORT_POINTS = 2_000  # of the surface that are surveyed after training, for words only
 
-# Observations of a point that are rendered again, at most
-OBSERVATIONS = 8
-# Directions that visibility is measured in where the scene has no map with its own
-DIRECTIONS = 64
-# Roughness over which the slope of the render is taken
-ROUGHNESS_STEP = 0.05
-# Views straight from above with which a place counts as half seen
-ENOUGH_VIEWS = 3.0
+OBSERVATIONS = 8  # of a point that are rendered again, at most
+DIRECTIONS = 64  # directions that visibility is measured in where the scene has no map with its own
+ROUGHNESS_STEP = 0.05  # roughness over which the slope of the render is taken
+ENOUGH_VIEWS = 3.0  # views straight from above with which a place counts as half seen
 # sRGB; disagreement with the photographs with which they count as half agreeing
 NOISE = 0.02
 # sRGB; darker pixels are noise
@@ -304,8 +300,7 @@ def render(
 # Voxels, over 2, that opposite sides of a thin part count as farther apart: a pixel takes its
 # expected error from its own side
 NORMAL_SCALE = 3.0
-# Nearest points that a pixel takes its expected error from
-NEIGHBOURS = 4
+NEIGHBOURS = 4  # nearest points that a pixel takes its expected error from
 
 
 def key_of(position: Tensor, normal: Tensor, voxel_size: float) -> np.ndarray:
@@ -340,17 +335,13 @@ class ExpectedErrors:
 # places were on the tuning half of the bank. No expected roughness is so certain
 GOOD = {"albedo": (0.05, 0.1), "normal": (8.0, 10.0)}
 UNITS = {"albedo": "", "normal": " degrees"}
-# Views; a material that fewer see is reported as a guess
-FEW_VIEWS = 3
-# Degrees of spread; views within are reported as one direction
-ONE_SIDE = 15.0
-# Share of a point's light; where less comes from outside, that is reported
-MIN_VISIBILITY = 0.5
+FEW_VIEWS = 3  # views; a material that fewer see is reported as a guess
+ONE_SIDE = 15.0  # degrees of spread; views within are reported as one direction
+MIN_VISIBILITY = 0.5  # share of a point's light; where less comes from outside, that is reported
 # Mean absolute difference of render and photographs, sRGB; where it is more, that is reported:
 # surface, material or light is wrong
 MAX_DISAGREEMENT = 0.05
-# Share of the surface below which nothing is reported about it
-MIN_SHARE = 0.01
+MIN_SHARE = 0.01  # share of the surface below which nothing is reported about it
 
 
 def numbers(surveyed: Survey) -> dict[str, float]:
@@ -420,12 +411,9 @@ def words(figures: dict[str, float], troubles: list[str]) -> str:
 # first, each with those before it taken as photographs. No truth is read.
 
 
-# Directions that are weighed, on the whole sphere
-CANDIDATES = 600
-# Degrees; photographs nearer to one another show much the same
-APART = 25.0
-# Degrees to the nearest photograph; directions beyond are a gap
-GAP = 30.0
+CANDIDATES = 600  # directions that are weighed, on the whole sphere
+APART = 25.0  # degrees; photographs nearer to one another show much the same
+GAP = 30.0  # degrees to the nearest photograph; directions beyond are a gap
 # Degrees below which nobody is sent, unless a photograph was taken from there: things stand on
 # something
 LOWEST = 0.0
