@@ -274,16 +274,10 @@ def composite_field_reference(
 def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) -> None:
     sdf, features, table, *rays = tensors
     *place, lower, upper, voxel_sizes, inv_s, min_share, _ = options
-    native.require().composite_field_forward(
-        grid_sampling.grid_of(table, *place),
-        *native.arrays(sdf, features),
-        *hash_grid.place_of(lower, upper, voxel_sizes),
-        *native.arrays(*rays),
-        inv_s,
-        min_share,
-        *native.arrays(*outputs),
-        native.threads(),
-    )
+    grid = grid_sampling.grid_of(table, *place)
+    levels = hash_grid.place_of(lower, upper, voxel_sizes)
+    read = sdf, features, *levels, *rays, inv_s, min_share
+    native.call("composite_field_forward", grid, *read, *outputs)
 
 
 def _backward(
@@ -293,26 +287,19 @@ def _backward(
     sdf, features, table, *rays, held = saved
     _, direction, t, _, offsets = rays
     *place, lower, upper, voxel_sizes, inv_s, min_share, sparse = options
-    core, grid = native.require(), grid_sampling.grid_of(table, *place)
+    grid = grid_sampling.grid_of(table, *place)
     levels = hash_grid.place_of(lower, upper, voxel_sizes)
     # Where samples lie, NaN where no features were read; and derivatives to what was read of them
     points, feature_points, of_gradient = (t.new_empty(len(t), 3) for _ in range(3))
     of_value, of_feature = torch.empty_like(t), t.new_empty(len(t), held.shape[1] - SAMPLE_NUMBERS)
-    core.composite_field_pulls(
-        grid,
-        *native.arrays(sdf, features),
-        *levels,
-        *native.arrays(*rays),
-        *(inv_s, min_share),
-        *native.arrays(held, grads[0], points, feature_points),
-        *native.arrays(of_value, of_gradient, of_feature),
-        native.threads(),
-    )
+    read = sdf, features, *levels, *rays, inv_s, min_share
+    filled = points, feature_points, of_value, of_gradient, of_feature
+    native.call("composite_field_pulls", grid, *read, held, grads[0], *filled)
     hashed, moved = bool(voxel_sizes), needs[2] or needs[3]
     of_nodes = sdf.new_empty(*sdf.shape, 0) if hashed else features
     node_feature = of_feature[:, :0] if hashed else of_feature
     order = torch.empty(len(t), dtype=torch.int32)
-    core.sort_by_tile(grid, *native.arrays(points, order), native.threads())
+    native.call("sort_by_tile", grid, points, order)
     of_sdf, of_features, of_points = grid_sampling.gradients(
         grid,
         (sdf, of_nodes, points, order),

@@ -351,8 +351,7 @@ def _forward_by_name(name: str) -> Forward:
     name = f"{name}_forward"
 
     def forward(tensors: Tensors, options: Sequence, outputs: Sequence[Tensor]) -> None:
-        kernel = getattr(native.require(), name)
-        kernel(*native.arrays(*tensors, *outputs), *options, native.threads())
+        native.call(name, *tensors, *outputs, *options)
 
     return forward
 
@@ -367,8 +366,7 @@ def _backward_by_name(name: str, to: list[int], optional: list[bool]) -> Backwar
             torch.empty_like(saved[i]) if need or not spared else saved[i].new_empty(0)
             for i, spared, need in zip(to, optional, needs, strict=True)
         ]
-        kernel = getattr(native.require(), name)
-        kernel(*native.arrays(*saved, *grads, *found), *options, native.threads())
+        native.call(name, *saved, *grads, *found, *options)
         return found
 
     return backward

@@ -72,11 +72,9 @@ def gradients(
         sparse: those to sdf and features hold touched rows only.
     """
     sdf, features, points, order = inputs
-    core, threads = native.require(), native.threads()
     rows = None, None
     if sparse:
-        touching = native.arrays(points, order)
-        rows = core.touched_rows(grid, *touching, sdf.numel(), *needs[:2], threads)
+        rows = native.call("touched_rows", grid, points, order, sdf.numel(), *needs[:2])
     into = [
         None
         if not need
@@ -85,7 +83,7 @@ def gradients(
         else t.new_empty(len(r), *t.shape[sdf.dim() :])
         for t, r, need in zip((sdf, features, points), (*rows, None), needs, strict=True)
     ]
-    core.sample_grid_backward(grid, *native.arrays(*inputs, *grad_outputs, *into), *rows, threads)
+    native.call("sample_grid_backward", grid, *inputs, *grad_outputs, *into, *rows)
     return [
         g if g is None or r is None else _sparse_tensor(r, g, t.shape, sdf.dim())
         for g, r, t in zip(into, (*rows, None), (sdf, features, points), strict=True)
@@ -105,11 +103,8 @@ def _sparse_tensor(rows: Any, values: Tensor, shape: torch.Size, dims: int) -> T
 def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) -> None:
     sdf, features, table, points = tensors
     value, gradient, feature, order = outputs
-    native.require().sample_grid_forward(
-        grid_of(table, *options[:3]),
-        *native.arrays(sdf, features, points, order, value, gradient, feature),
-        native.threads(),
-    )
+    grid, filled = grid_of(table, *options[:3]), (order, value, gradient, feature)
+    native.call("sample_grid_forward", grid, sdf, features, points, *filled)
 
 
 def _backward(

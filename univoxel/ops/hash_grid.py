@@ -192,7 +192,7 @@ def place_of(lower: list[float], upper: list[float], voxel_sizes: list[float]) -
 
 def _touched(table: Tensor, points: Tensor, place: Place) -> tuple[Any, Tensor]:
     """The rows that points read, as the extension has them, and as [K] int64, ascending."""
-    touched = native.require().hash_rows(*native.arrays(table, points), *place, native.threads())
+    touched = native.call("hash_rows", table, points, *place)
     rows = torch.empty(len(touched), dtype=torch.int64)
     touched.write(rows.numpy(), native.threads())
     return touched, rows
@@ -220,14 +220,8 @@ def gradients(
     elif needs[0]:
         of_table = torch.empty_like(table)
     of_points = torch.empty_like(points) if needs[1] else None
-    native.require().encode_hash_backward(
-        *native.arrays(table, points, grad_out, of_table),
-        touched,
-        *native.arrays(of_points),
-        *place,
-        felt,
-        native.threads(),
-    )
+    filled = of_table, touched, of_points
+    native.call("encode_hash_backward", table, points, grad_out, *filled, *place, felt)
     if rows is not None and of_table is not None:
         # They are distinct, in order and inside by construction: checking costs more than they do
         of_table = torch.sparse_coo_tensor(
@@ -237,9 +231,7 @@ def gradients(
 
 
 def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) -> None:
-    native.require().encode_hash_forward(
-        *native.arrays(*tensors, *outputs), *place_of(*options[:3]), native.threads()
-    )
+    native.call("encode_hash_forward", *tensors, *outputs, *place_of(*options[:3]))
 
 
 def _backward(

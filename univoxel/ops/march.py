@@ -33,7 +33,7 @@ def brick_minimum(sdf: Tensor, bricks: Bricks | None = None) -> Tensor:
     check("brick_minimum", sdf=(sdf, "X Y Z"))
     if native.serves(sdf):
         out = sdf.new_empty([max(1, (n - 2) // BRICK + 1) for n in sdf.shape])
-        native.require().brick_minimum(*native.arrays(sdf.contiguous(), out), native.threads())
+        native.call("brick_minimum", sdf.contiguous(), out)
         return out
     for axis in range(3):
         n = sdf.shape[axis]
@@ -52,12 +52,8 @@ def _sparse_brick_minimum(sdf: Tensor, bricks: Bricks) -> Tensor:
     n = len(bricks.place)
     if native.serves(sdf):
         out = sdf.new_empty(n)
-        native.require().sparse_brick_minimum(
-            *native.arrays(sdf.contiguous(), bricks.table, bricks.place),
-            bricks.size,
-            out.numpy(),
-            native.threads(),
-        )
+        where = bricks.table, bricks.place, bricks.size
+        native.call("sparse_brick_minimum", sdf.contiguous(), *where, out)
         return out
     out = sdf.new_full((n,), torch.inf)
     out[1] = -torch.inf
@@ -138,17 +134,13 @@ def march(
             early_stop=early_stop,
         )
     tensors = [t.contiguous() for t in (sdf, brick_min, origin, direction, jitter)]
-    t, connected, offsets = native.require().march(
-        *native.arrays(*tensors),
+    t, connected, offsets = native.call(
+        "march",
+        *tensors,
         tuple(map(float, grid_origin)),
-        float(voxel_size),
-        float(step),
-        float(inv_s),
-        float(min_weight),
-        float(early_stop),
-        None if bricks is None else bricks.table.numpy(),
+        *map(float, (voxel_size, step, inv_s, min_weight, early_stop)),
+        None if bricks is None else bricks.table,
         sdf.shape if bricks is None else bricks.size,
-        native.threads(),
     )
     return Samples(
         torch.from_numpy(t), torch.from_numpy(connected).bool(), torch.from_numpy(offsets)

@@ -184,18 +184,24 @@ def require_embree(what: str) -> ModuleType:
     return found
 
 
-def arrays(*tensors: Tensor | None) -> list[Any]:
-    """NumPy views of tensors, as the extension takes them: halves as their bits, None as it is."""
+def call(kernel: str, *arguments: Any) -> Any:
+    """Call a kernel: with tensors as `arrays`, and the number of threads as last argument."""
+    return getattr(require(), kernel)(*arrays(*arguments), threads())
+
+
+def arrays(*arguments: Any) -> list[Any]:
+    """NumPy views of tensors, as the extension takes them: halves as their bits. What is no tensor
+    stays as it is."""
     # Every call of an op pays for each of these steps
     return [
         t
-        if t is None
+        if not isinstance(t, Tensor)
         else t.view(torch.uint16).numpy()
         if t.dtype is torch.float16
         else t.detach().numpy()
         if t.requires_grad
         else t.numpy()
-        for t in tensors
+        for t in arguments
     ]
 
 

@@ -139,11 +139,8 @@ def _looked_up(brightness: Tensor, views: Tensor, x: Tensor, y: Tensor) -> tuple
 
 def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) -> None:
     correlation, seen, slopes = outputs
-    native.require().patch_correlation(
-        *native.arrays(*tensors, correlation, seen.view(torch.uint8), slopes),
-        *options,
-        native.threads(),
-    )
+    filled = correlation, seen.view(torch.uint8), slopes
+    native.call("patch_correlation", *tensors, *filled, *options)
 
 
 def _backward(
@@ -241,9 +238,7 @@ def match_cost(
     aligned = pictures.clone() if pictures.storage_offset() % 4 else pictures
     pixels = aligned.contiguous().view(torch.int32)[..., 0]  # four bytes are looked up at once
     tensors = [t.contiguous() for t in (pixels, matrix, *rays)]
-    native.require().match_cost(
-        *native.arrays(*tensors, cost), step, most, radius, best, native.threads()
-    )
+    native.call("match_cost", *tensors, cost, step, most, radius, best)
     return cost
 
 
@@ -320,8 +315,7 @@ def semi_global(cost: Tensor, rows: Tensor, small: float, large: float) -> Tenso
         return semi_global_reference(cost, rows, small, large)
     cost, rows = cost.contiguous(), rows.contiguous()
     total = torch.empty_like(cost)
-    options = small, large, native.threads()
-    native.require().semi_global(*native.arrays(cost, rows, total), *options)
+    native.call("semi_global", cost, rows, total, small, large)
     return total
 
 

@@ -98,9 +98,7 @@ def adam_rows_reference_(
 
 _adam_rows = native.Operator(
     "adam_rows_",
-    lambda *inputs: native.require().adam_rows(
-        *native.arrays(*inputs[:5]), *inputs[5:], native.threads()
-    ),
+    lambda *inputs: native.call("adam_rows", *inputs),
     "(Tensor(a!) param, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, Tensor rows, Tensor grad, "
     "float lr, float beta1, float beta2, float eps, int step) -> ()",
     lambda *_: None,
@@ -149,12 +147,11 @@ def sum_rows(
         raise ValueError(f"sum_rows: every size in shape must be at least 1, got {list(shape)}")
     if not native.serves(values[0]):
         return sum_rows_reference(rows, values, shape)
-    core, threads = native.require(), native.threads()
     lists = [native.arrays(*(t.contiguous() for t in several)) for several in (rows, values)]
-    union = core.union_rows(*lists, math.prod(shape), threads)
+    union = native.call("union_rows", *lists, math.prod(shape))
     indices = torch.empty(len(shape), len(union), dtype=torch.int64)
     total = values[0].new_empty(len(union), values[0].shape[1])
-    core.sum_rows(*lists, union, *native.arrays(total, indices), list(shape), threads)
+    native.call("sum_rows", *lists, union, total, indices, list(shape))
     return indices, total
 
 

@@ -63,16 +63,14 @@ def decode_lobes_reference(
 
 
 def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) -> None:
-    parameters, *lobes = native.arrays(*tensors, *outputs)
-    native.require().decode_lobes_forward(parameters, *options, *lobes, native.threads())
+    native.call("decode_lobes_forward", *tensors, *options, *outputs)
 
 
 def _backward(
     saved: Sequence, grads: Sequence[Tensor], options: Sequence, _: list[bool]
 ) -> list[Tensor]:
     grad = torch.empty_like(saved[0])
-    parameters, *others = native.arrays(*saved, *grads, grad)
-    native.require().decode_lobes_backward(parameters, *options, *others, native.threads())
+    native.call("decode_lobes_backward", *saved, *options, *grads, grad)
     return [grad]
 
 

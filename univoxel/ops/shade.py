@@ -275,8 +275,7 @@ def specular_response(
         return specular_response_reference(normal, wo, roughness, directions, solid_angle, f0)
     response = normal.new_empty(sizes["N"], sizes["D"])
     inputs = [x.contiguous() for x in (normal, wo, roughness, directions)]
-    options = float(f0), float(solid_angle), native.threads()
-    native.require().specular_response(*native.arrays(*inputs, response), *options)
+    native.call("specular_response", *inputs, response, float(f0), float(solid_angle))
     return response
 
 

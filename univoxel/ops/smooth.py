@@ -48,13 +48,11 @@ def smooth_rows_(
         raise ValueError("smooth_rows_: grid is changed in place, so it must be contiguous")
     if not native.serves(grid):
         return smooth_rows_reference_(grid, rows, amount, order, bricks)
-    core, rows = native.require(), rows.contiguous()
-    options = (float(amount), order, native.threads())
+    rest = rows.contiguous(), float(amount), order
     if bricks is None:
-        core.smooth_rows(*native.arrays(grid, rows), *options)
+        native.call("smooth_rows", grid, *rest)
     else:
-        where = (*native.arrays(bricks.table, bricks.place), bricks.size)
-        core.smooth_brick_rows(grid.detach().numpy(), *where, rows.numpy(), *options)
+        native.call("smooth_brick_rows", grid, bricks.table, bricks.place, bricks.size, *rest)
     return grid
 
 
@@ -116,14 +114,11 @@ def diffuse_rows_(
         raise ValueError("diffuse_rows_: values are changed in place, so they must be contiguous")
     if not native.serves(values):
         return diffuse_rows_reference_(values, rows, size, amount, passes, bricks)
-    core, of_rows = native.require(), rows.contiguous().numpy()
-    options = (float(amount), int(passes), native.threads())
-    changed = values.detach().numpy()
+    rest = list(size), rows.contiguous(), float(amount), int(passes)
     if bricks is None:
-        core.diffuse_rows(changed, list(size), of_rows, *options)
+        native.call("diffuse_rows", values, *rest)
     else:
-        where = (*native.arrays(bricks.table, bricks.place), list(size))
-        core.diffuse_brick_rows(changed, *where, of_rows, *options)
+        native.call("diffuse_brick_rows", values, bricks.table, bricks.place, *rest)
     return values
 
 
