@@ -75,8 +75,7 @@ Scenes: TypeAlias = Annotated[
     tuple[Path, ...], Written("SCENE [SCENE ...]", "(required)", positional=True)
 ]
 Changes: TypeAlias = Annotated[
-    tuple[str, ...],
-    Written("FIELD=VALUE", "(repeatable)", "set", repeatable=True, advanced=True),
+    tuple[str, ...], Written("FIELD=VALUE", "(repeatable)", "set", repeatable=True, advanced=True)
 ]
 Minutes: TypeAlias = Annotated[float | None, written("MINUTES", "none")]
 ConfigFile: TypeAlias = Annotated[Path | None, written("FILE", "from --preset", advanced=True)]

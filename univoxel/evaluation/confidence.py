@@ -218,10 +218,7 @@ def spread_observations(observations: Observations, most: int) -> tuple[Tensor, 
 
 
 def compare(
-    scene: Scene,
-    observations: Observations,
-    transport: Transport,
-    which: tuple[Tensor, Tensor],
+    scene: Scene, observations: Observations, transport: Transport, which: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor]:
     """Mean absolute sRGB difference between photographs and render, and root mean square of the
     render's slope by roughness: [P] each; 0 for points without observations.

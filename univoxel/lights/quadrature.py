@@ -11,11 +11,7 @@ from torch import Tensor, nn
 from univoxel import brdf, ops, sphere
 from univoxel.core.records import Occlusion, Surface
 from univoxel.lights import base
-from univoxel.lights.base import (
-    AbstractLight,
-    AbstractLocalLight,
-    Regularisation,
-)
+from univoxel.lights.base import AbstractLight, AbstractLocalLight, Regularisation
 
 
 def rotations(
