@@ -93,7 +93,7 @@ def gradients(
 def _sparse_tensor(rows: Any, values: Tensor, shape: torch.Size, dims: int) -> Tensor:
     """Values of touched rows as a tensor that is sparse in its first dimensions."""
     indices = torch.empty(dims, len(rows), dtype=torch.int64)
-    rows.write(indices.numpy(), native.threads())
+    native.call(rows.write, indices)
     # The rows are distinct, in order and inside by construction: checking costs more than they do.
     return torch.sparse_coo_tensor(
         indices, values, shape, is_coalesced=True, check_invariants=False

@@ -194,7 +194,7 @@ def _touched(table: Tensor, points: Tensor, place: Place) -> tuple[Any, Tensor]:
     """The rows that points read, as the extension has them, and as [K] int64, ascending."""
     touched = native.call("hash_rows", table, points, *place)
     rows = torch.empty(len(touched), dtype=torch.int64)
-    touched.write(rows.numpy(), native.threads())
+    native.call(touched.write, rows)
     return touched, rows
 
 

@@ -184,9 +184,11 @@ def require_embree(what: str) -> ModuleType:
     return found
 
 
-def call(kernel: str, *arguments: Any) -> Any:
-    """Call a kernel: with tensors as `arrays`, and the number of threads as last argument."""
-    return getattr(require(), kernel)(*arrays(*arguments), threads())
+def call(kernel: str | Callable, *arguments: Any) -> Any:
+    """Call a kernel, by name or as it is: with tensors as `arrays`, and the number of threads as
+    last argument."""
+    kernel = getattr(require(), kernel) if isinstance(kernel, str) else kernel
+    return kernel(*arrays(*arguments), threads())
 
 
 def arrays(*arguments: Any) -> list[Any]:
