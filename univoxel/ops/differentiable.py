@@ -186,11 +186,15 @@ class Differentiable(native.Operator):
         self._traced = traced
         spared = [names[i] in optional.split() for i in self._to]
         self._find = backward or _backward_by_name(name, self._to, spared)
-        fill = forward or _forward_by_name(name)
+        kernel = f"{name}_forward"
 
         def run(tensors: Tensors, options: Sequence) -> Any:
             out = allocate(*tensors, *options)
-            fill(tensors, options, out if outputs > 1 else (out,))
+            filled = out if outputs > 1 else (out,)
+            if forward is None:
+                native.call(kernel, *tensors, *filled, *options)
+            else:
+                forward(tensors, options, filled)
             return out
 
         returned = ", ".join(["Tensor"] * outputs)
@@ -345,15 +349,6 @@ class _Once(torch.autograd.Function):
             f"{ctx.name}: cannot differentiate twice, because only the reference of the op has "
             'second derivatives: use univoxel.ops.use_backend("reference")'
         )
-
-
-def _forward_by_name(name: str) -> Forward:
-    name = f"{name}_forward"
-
-    def forward(tensors: Tensors, options: Sequence, outputs: Sequence[Tensor]) -> None:
-        native.call(name, *tensors, *outputs, *options)
-
-    return forward
 
 
 def _backward_by_name(name: str, to: list[int], optional: list[bool]) -> Backward:
