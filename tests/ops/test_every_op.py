@@ -294,7 +294,7 @@ REFUSED = {
     "smooth_rows_ of bricks": [
         *(({"rows": torch.tensor([x])}, "rows must be of bricks that stand somewhere")
           for x in (0, 127, 64 * 1000, -1)),
-        ({"grid": torch.zeros(64, 1)}, r"grid must be \[\d+, C\]"),
+        ({"grid": torch.zeros(64, 1)}, r"grid must be \[R, C\] .* with n=\d+, R=\d+, got"),
     ],
     "diffuse_rows_": [
         *(
