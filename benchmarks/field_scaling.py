@@ -28,8 +28,7 @@ from made import made
 
 from lab.record import result_text
 from univoxel.core.records import Rays
-from univoxel.fields.features import PER_LEVEL, Levels
-from univoxel.fields.field import Field, dense_field, hash_field
+from univoxel.fields.field import PER_LEVEL, Field, Levels, dense_field, hash_field
 from univoxel.fields.grid import GridShape
 from univoxel.ops import composite, section_alpha
 from univoxel.optim import RowAdam, rows_of
@@ -119,7 +118,7 @@ def case(kind: str, size: int, channels: int, steps: int) -> dict:
             assert field.features.grad is not None
             touched, read = rows_of(field.sdf.grad), rows_of(field.features.grad)
             field.distances.smooth_rows_(field.sdf.detach(), touched, 0.01, order=2)
-            field.encoding.smooth_(field.distances, read, 0.01)
+            field.smooth_features_(read, 0.01)
         seconds.append(time.perf_counter() - begin)
     peak = resident()
     begin = time.perf_counter()

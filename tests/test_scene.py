@@ -18,8 +18,7 @@ from univoxel import lights
 from univoxel.errors import ConfigError
 from univoxel.fields import field as fields
 from univoxel.fields.bricks import BrickDistances
-from univoxel.fields.features import Levels
-from univoxel.fields.field import dense_field, hash_field
+from univoxel.fields.field import Levels, dense_field, hash_field
 from univoxel.fields.grid import fit_grid
 from univoxel.scene import FILE, SHELL, Scene, SceneConfig, load_checkpoint, load_scene, save_scene
 from univoxel.training.compression import drop_mirror_levels_
@@ -188,7 +187,7 @@ def test_a_checkpoint_of_a_hash_field(tmp_path, monkeypatch, dense_most, slim):
     again = load_scene(tmp_path).field
     assert again.kind == "hash"
     assert isinstance(again.distances, BrickDistances) == (dense_most == 1000)
-    assert (again.grid, again.encoding.levels) == (field.grid, field.encoding.levels)
+    assert (again.grid, again.levels) == (field.grid, field.levels)
     half = {"rtol": 2**-11 if slim else 0.0, "atol": 1e-7 * slim}
     torch.testing.assert_close(again.sdf, field.sdf[: len(again.sdf)], **half)
     read = field.rows_near(SHELL * field.voxel_size if slim else math.inf)[:, None]

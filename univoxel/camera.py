@@ -58,11 +58,7 @@ class Cameras:
 
 
 def stacked(pictures: Sequence[Tensor], beyond: float = 0) -> Tensor:
-    """Pictures [h, w, ...] of any sizes as `Cameras` has them stored: [V, H, W, ...].
-
-    Args:
-        beyond: what is if there is no picture.
-    """
+    """Pictures [h, w, ...] of any sizes as `Cameras` has them stored: [V, H, W, ...]."""
     first = pictures[0]
     if all(picture.shape == first.shape for picture in pictures):
         return torch.stack(list(pictures))
@@ -278,11 +274,8 @@ class PoseSteps(nn.Module):
         return len(self.steps)
 
     def corrected(self, cameras: Cameras) -> Cameras:
-        """The cameras where they are believed to be; differentiable in training.
-
-        Raises:
-            UserError: another number of cameras.
-        """
+        """The cameras where they are believed to be, differentiable in training; a UserError for
+        another number of cameras."""
         if len(cameras) != len(self):
             raise UserError(
                 f"expected the {len(self)} photographs whose camera poses the run refined, got "

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from univoxel import __version__
 from univoxel.core.choices import (
@@ -18,17 +16,9 @@ from univoxel.core.choices import (
     MasksFrom,
 )
 from univoxel.core.files import read_json, write_json
-from univoxel.core.validation import (
-    EARLIER,
-    about,
-    check_fields,
-    check_settings,
-    record,
-    setting,
-    without_retired,
-)
+from univoxel.core.validation import about, check_fields, check_settings, record, setting
 from univoxel.errors import ConfigError, MissingFile, UserError
-from univoxel.fields.features import PER_LEVEL
+from univoxel.fields.field import PER_LEVEL
 from univoxel.lights import read_config
 from univoxel.scene import SceneConfig
 
@@ -251,9 +241,6 @@ def save_config(cfg: TrainConfig) -> None:
     """Write the resolved configuration to config.json in the run's folder, atomically.
 
     The version of the package comes first, because it determines all other constants.
-
-    Raises:
-        OSError: it cannot be written.
     """
     values = {"version": __version__} | dataclasses.asdict(cfg)
     write_json(cfg.out / "config.json", values)
@@ -282,61 +269,21 @@ def load_config(path: Path) -> TrainConfig:
 
 
 def check_same(cfg: TrainConfig) -> None:
-    """Refuse to resume the run in cfg.out with other stages or another model.
-
-    Raises:
-        UserError: they differ, or config.json cannot be read.
-    """
+    """Refuse, by a UserError, to resume the run in cfg.out with other stages or another model."""
     path = cfg.out / "config.json"
     try:
-        before = read_json(path)
+        before = load_config(path)
+        if "voxel_pixels" not in read_json(path):  # of configurations from before there were any
+            before = dataclasses.replace(before, voxel_pixels=0.0)
     except (OSError, UserError) as error:
         raise UserError(f"{path}: this run cannot be resumed: {error}") from None
-    if not isinstance(before, dict):
-        raise UserError(f"{path}: expected a JSON object of settings, got {before!r:.80}")
-    began = _completed(before, cfg)
-    # of configurations from before there were any
-    since = {"downscale": 1, "voxel_pixels": 0.0}
-    began |= {name: value for name, value in since.items() if name not in before}
-    now = _as_json(cfg)
-    for one in (began, now):
-        one["downscale"] = one["downscale"] or 1  # 0 was 1 before it was found
+    # 0 was 1 before it was found
+    before, now = (dataclasses.replace(c, downscale=c.downscale or 1) for c in (before, cfg))
     names = "stages scene downscale voxel_pixels capacity budget_mb masks cameras exposures"
     for name in [*names.split(), "light_frame"]:
-        if began.get(name) != now[name]:
+        if getattr(before, name) != getattr(now, name):
             raise UserError(
                 f"{path}: the run was started with another {name}: to resume it, pass the same "
                 f"{', '.join(CHOICES[:-1])} and {CHOICES[-1]} as before",
                 *CHOICES,
             )
-
-
-def _completed(before: Any, now: Any) -> Any:
-    """A configuration from JSON with the defaults of fields that were added since, and without
-    those that are retired.
-
-    Args:
-        now: a configuration of the same classes.
-    """
-    if isinstance(now, tuple) and isinstance(before, list) and len(before) == len(now):
-        return [_completed(b, n) for b, n in zip(before, now, strict=True)]
-    if not dataclasses.is_dataclass(now) or not isinstance(before, dict):
-        return before
-    result = without_retired(type(now), EARLIER.get(type(now).__name__, {}) | before)
-    for known in dataclasses.fields(now):
-        if known.name in result:
-            result[known.name] = _completed(result[known.name], getattr(now, known.name))
-        elif known.name == "kind":  # of a light: files from before there were others do not say
-            result["kind"] = "sg"
-        elif known.default is not dataclasses.MISSING:
-            result[known.name] = _as_json(known.default)
-        elif known.default_factory is not dataclasses.MISSING:
-            result[known.name] = _as_json(known.default_factory())
-    return result
-
-
-def _as_json(value: Any) -> Any:
-    """A configuration, or a value of one, as config.json holds it."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        value = dataclasses.asdict(value)
-    return json.loads(json.dumps(value, default=str))

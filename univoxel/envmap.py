@@ -127,12 +127,8 @@ UNDERSHOOT = 0.01  # of the largest radiance: texels that are less below 0 are 0
 
 
 def read_map(path: Path) -> EnvMap:
-    """A file as an environment map.
-
-    Raises:
-        DataError: it cannot be used as one; the message names it.
-        OSError: it cannot be read.
-    """
+    """A file as an environment map; a DataError, which names it, or an OSError if it cannot be
+    used."""
     if path.suffix.lower() in SUFFIXES and kind_of(path) not in (".exr", ".hdr"):
         raise DataError(
             f"{path}: expected an environment map (.hdr or .exr), got an image with 8 or 16 bits, "

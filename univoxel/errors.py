@@ -30,6 +30,12 @@ class UserError(ValueError):
         self.arguments = arguments
 
 
+def demand(holds: bool, name: str, wanted: str, value: object) -> None:
+    """Refuse, by a UserError, an argument whose value is not as wanted."""
+    if not holds:
+        raise UserError(f"{name} must be {wanted}, got {value}", name)
+
+
 class ConfigError(UserError):
     """A configuration is contradictory or has a field that is out of range."""
 

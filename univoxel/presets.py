@@ -10,7 +10,7 @@ from typing import Any
 from univoxel import lights
 from univoxel.config import PREPARATION, JointConfig, LossConfig, StageConfig, TrainConfig
 from univoxel.core.choices import LIGHTS, Differing, FieldName, LightName, Metal
-from univoxel.errors import UserError
+from univoxel.errors import UserError, demand
 from univoxel.scene import SceneConfig
 
 
@@ -61,8 +61,7 @@ def preset(
     Raises:
         UserError: an unknown name, or varying light with a map from the beginning.
     """
-    if name not in PRESETS:
-        raise UserError(f"preset must be one of {', '.join(PRESETS)}, got {name!r}", "preset")
+    demand(name in PRESETS, "preset", f"one of {', '.join(PRESETS)}", repr(name))
     return _configuration(PRESETS[name], data, out, light, varying)
 
 
@@ -86,8 +85,7 @@ def budget(
         UserError: minutes is out of range, there is no such light, or the light varies and is one
             map from the beginning.
     """
-    if not 0 < minutes < math.inf:
-        raise UserError(f"minutes must be above 0, got {minutes:g}", "minutes")
+    demand(0 < minutes < math.inf, "minutes", "above 0", f"{minutes:g}")
     work = work_in((1 - PREPARATION) * minutes)
     return replace(_configuration(work, data, out, light, varying), minutes=minutes)
 
@@ -121,11 +119,8 @@ def with_field(cfg: TrainConfig, kind: FieldName) -> TrainConfig:
 
 
 def with_metal(cfg: TrainConfig, metal: Metal) -> TrainConfig:
-    """The same configuration, given whether the object is all metal.
-
-    Raises:
-        UserError: it is, but no stage solves for an environment map.
-    """
+    """The same configuration, given whether the object is all metal; a UserError if it is, but no
+    stage solves for an environment map."""
     if metal == "auto":
         return cfg
     if not any(isinstance(s, JointConfig) for s in cfg.stages):
@@ -204,8 +199,7 @@ def _configuration(
             loss = LossConfig(light_smoothness=1.0) if light == "sg" else LossConfig()
             stages, capacity = (coarse, fine), "fixed"
         case _:
-            names = ", ".join(LIGHTS)
-            raise UserError(f"light must be one of {names}, got {light!r}", "light")
+            raise UserError(f"light must be one of {', '.join(LIGHTS)}, got {light!r}", "light")
     turns = isinstance(scene.light, lights.LocalLightConfig) and known != "light"
     detailed = work.minutes > PRESETS["draft"].minutes and light != "baked"
     return TrainConfig(

@@ -61,22 +61,15 @@ WORLD = "world.json"  # in the folder of a run whose world is not that of its da
 
 
 def save_world(moved: np.ndarray | None, run: Path) -> None:
-    """Write the transform from the world of the data's files to that of the run, as in `Photos`.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write the transform from the world of the data's files to that of the run, as in `Photos`."""
     (run / WORLD).unlink(missing_ok=True)
     if moved is not None:
         write_json(run / WORLD, {"from_data": moved.tolist()})
 
 
 def load_world(run: Path) -> np.ndarray | None:
-    """[3, 4], as in `Photos.moved`; None also of runs of earlier versions, which kept none.
-
-    Raises:
-        DataError: the file cannot be read.
-    """
+    """[3, 4], as in `Photos.moved`; None also of runs of earlier versions, which kept none. A
+    DataError if the file cannot be read."""
     path = run / WORLD
     if not path.is_file():
         return None
@@ -177,42 +170,34 @@ def judge(evidence: Evidence) -> Verdict:
     """The verdict that evidence leads to."""
     faults: list[tuple[bool, str, str]] = []  # whether it is poor, the reason, the remedy
 
-    def check(value: float | None, good: float, poor: float, reason: str, remedy: str) -> None:
-        """Note a value that is not good; NaN is poor. If good > poor, more is better."""
-        if value is None:
-            return
+    # What is measured, what of it is good and poor, the reason against it, the remedy. If good is
+    # above poor, more is better; NaN is poor
+    measured = (
+        (
+            *(evidence.psnr, GOOD_DB, POOR_DB),
+            f"validation PSNR {{:.1f}} dB ({GOOD_DB:g} or more is good)",
+            "take sharp photographs with one exposure, and do not move the object or the light",
+        ),
+        (
+            *(evidence.outline, GOOD_OUTLINE, POOR_OUTLINE),
+            "{:.0%} of the validation pixels contradict the masks",
+            "correct the masks",
+        ),
+        (
+            *(evidence.hidden, GOOD_HIDDEN, POOR_HIDDEN),
+            "{:.0%} of the surface is seen by too few cameras",
+            "take more photographs from the directions that `univoxel report` shows",
+        ),
+        (
+            *(evidence.residual, GOOD_RESIDUAL, POOR_RESIDUAL),
+            "{:.0%} of the surface differs visibly from its photographs",
+            "train with `--preset full`, if the masks are correct and the object did not move",
+        ),
+    )
+    for value, good, poor, reason, remedy in measured:
         sign = 1 if good > poor else -1
-        if not sign * value >= sign * good:
+        if value is not None and not sign * value >= sign * good:
             faults.append((not sign * value >= sign * poor, reason.format(value), remedy))
-
-    check(
-        evidence.psnr,
-        GOOD_DB,
-        POOR_DB,
-        f"validation PSNR {{:.1f}} dB ({GOOD_DB:g} or more is good)",
-        "take sharp photographs with one exposure, and do not move the object or the light",
-    )
-    check(
-        evidence.outline,
-        GOOD_OUTLINE,
-        POOR_OUTLINE,
-        "{:.0%} of the validation pixels contradict the masks",
-        "correct the masks",
-    )
-    check(
-        evidence.hidden,
-        GOOD_HIDDEN,
-        POOR_HIDDEN,
-        "{:.0%} of the surface is seen by too few cameras",
-        "take more photographs from the directions that `univoxel report` shows",
-    )
-    check(
-        evidence.residual,
-        GOOD_RESIDUAL,
-        POOR_RESIDUAL,
-        "{:.0%} of the surface differs visibly from its photographs",
-        "train with `--preset full`, if the masks are correct and the object did not move",
-    )
     if evidence.troubles:
         times = "once" if evidence.troubles == 1 else f"{evidence.troubles} times"
         faults.append((False, f"training failed {times} and recovered", "try another `--seed`"))
@@ -237,11 +222,7 @@ def judge(evidence: Evidence) -> Verdict:
 
 
 def save_verdict(verdict: Verdict, run: Path) -> None:
-    """Write the verdict to verdict.json in the run's folder, whole or not at all.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write the verdict to verdict.json in the run's folder, whole or not at all."""
     write_json(run / FILE, as_json(verdict))
 
 

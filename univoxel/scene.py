@@ -25,8 +25,7 @@ from univoxel.data import Photos
 from univoxel.errors import ConfigError, DataError, FileError, MissingFile, UserError
 from univoxel.fields.bricks import BrickDistances, pack_bricks, unpack_bricks
 from univoxel.fields.distances import PACKED, DenseDistances, SurfaceVersion, pack, unpack
-from univoxel.fields.features import HashFeatures, Levels, NodeFeatures
-from univoxel.fields.field import Field, MaterialHead, RadianceHead
+from univoxel.fields.field import Field, HashField, Levels, MaterialHead, NodeField, RadianceHead
 from univoxel.fields.grid import GridShape
 from univoxel.lights.base import MOST_ROWS, MirroredLight
 from univoxel.lights.latlong import DistantLight
@@ -157,21 +156,15 @@ class Scene(nn.Module):
         return radiance if self.views is None else radiance * self.views.gain(view)
 
     def registered(self, photos: Photos) -> Photos:
-        """The photographs that it was trained on, their cameras where they are believed to be.
-
-        Raises:
-            ValueError: other photographs, where cameras are refined.
-        """
+        """The photographs that it was trained on, their cameras where they are believed to be; a
+        UserError for others, where cameras are refined."""
         if self.poses is None:
             return photos
         return replace(photos, cameras=self.poses.corrected(photos.cameras))
 
     def show_light_of(self, view: str | None) -> None:
-        """Choose the photograph, by name or number, whose light is used; None: the mean of all.
-
-        Raises:
-            ValueError: there is no such photograph, or the scene has one light for all.
-        """
+        """Choose the photograph, by name or number, whose light is used; None: the mean of all. A
+        UserError if there is no such photograph, or one light for all."""
         if self.views is not None:
             self.views.choose(view)
         elif view is not None:
@@ -184,10 +177,7 @@ class Scene(nn.Module):
 
     def occluder(self) -> VisibilityScene:
         """The present surface, ready for rays; within `surface_held`, the one that is held.
-
-        Raises:
-            ValueError: the scene has no surface.
-        """
+        NoSurface if there is none."""
         if self._traced is not None:
             tracer, version = self._traced
             if self._held or version.holds(self.field.sdf):
@@ -254,7 +244,7 @@ def stored(scene: Scene, slim: bool = False, reach: float | None = None) -> dict
         sdf = tensors["field.sdf"] = sdf[: Bricks.NODES * bricks.count]
     # Features that no sample has touched are 0: only the others are stored.
     features = scene.field.features.detach().flatten(0, -2)
-    if isinstance(scene.field.encoding, NodeFeatures):
+    if isinstance(scene.field, NodeField):
         features = features[: sdf.numel()]
     touched = features.any(1)
     if slim:
@@ -300,8 +290,8 @@ def save_scene(
         "inv_s": scene.inv_s,
         "state": state,
     }
-    if isinstance(scene.field.encoding, HashFeatures):
-        meta["levels"] = astuple(scene.field.encoding.levels)
+    if isinstance(scene.field, HashField):
+        meta["levels"] = astuple(scene.field.levels)
     path = run / FILE
     try:
         with replacing(path) as temporary:
@@ -451,10 +441,9 @@ def _scene(about: Description, bricks: Bricks | None) -> Scene:
     """A scene as described, its values yet unknown."""
     distances = DenseDistances(about.grid) if bricks is None else BrickDistances(about.grid, bricks)
     if about.levels:
-        encoding = HashFeatures(about.levels)
+        field = HashField(distances, about.levels)
     else:
-        encoding = NodeFeatures(torch.zeros(*distances.sdf.shape, about.scene.channels))
-    field = Field(distances, encoding)
+        field = NodeField(distances, torch.zeros(*distances.sdf.shape, about.scene.channels))
     if field.channels != about.scene.channels:
         raise ValueError(
             f"the field has {field.channels} channels, but the networks use {about.scene.channels}"

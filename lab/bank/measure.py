@@ -21,8 +21,8 @@ from univoxel.evaluation.measures import (
     errors_of,
     expected_view,
     render_layers,
+    survey_of,
 )
-from univoxel.evaluation.views import survey_of
 from univoxel.render.pipeline import surface_of_view
 from univoxel.scene import Scene, load_checkpoint
 

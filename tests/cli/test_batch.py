@@ -264,7 +264,7 @@ def test_what_a_training_of_a_batch_is_asked_for(tmp_path):
     alike = options(1, config=tmp_path / "config.json", changes=("seed=2",))
     assert f"--config {tmp_path / 'config.json'} --set=seed=2" in alike
     asked = dataclasses.replace(USUAL, config=tmp_path / "config.json", minutes=2.0)
-    assert asked.training() == dataclasses.replace(config, minutes=2.0)
+    assert asked.training() == dataclasses.replace(config, out=Path(), minutes=2.0)
 
 
 def test_a_machine_is_shared(scenes, tmp_path):
@@ -317,7 +317,7 @@ def test_mistakes_are_found_before_anything_is_begun(scenes, tmp_path, monkeypat
         (
             "config",
             tmp_path / "none.json",
-            "config cannot be combined with preset or light: .*none",
+            "preset=.* cannot be combined with config: .*none.json sets it too",
         ),
     ):
         refused(UserError, match, options=dataclasses.replace(OPTIONS, **{field: value}))

@@ -306,8 +306,8 @@ def test_bad_folders(folders, relit_calls, change, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"samples": 0}, "expected samples >= 1 and bounces >= 0"),
-        ({"bounces": -1}, "expected samples >= 1 and bounces >= 0"),
+        ({"samples": 0}, "samples must be at least 1, got 0"),
+        ({"bounces": -1}, "bounces must be at least 0, got -1"),
         ({"light_of": "r_0", "fit_light": True}, "expected light_of or fit_light, but not both"),
     ],
 )

@@ -11,8 +11,16 @@ from torch import nn
 from univoxel.core.records import Rays
 from univoxel.fields import field as fields
 from univoxel.fields.bricks import BrickDistances
-from univoxel.fields.features import COARSEST, PER_LEVEL, ROWS, HashFeatures, Levels
-from univoxel.fields.field import Field, dense_field, hash_field
+from univoxel.fields.field import (
+    COARSEST,
+    PER_LEVEL,
+    ROWS,
+    Field,
+    HashField,
+    Levels,
+    dense_field,
+    hash_field,
+)
 from univoxel.fields.grid import GridShape
 from univoxel.ops import encode_hash
 
@@ -47,7 +55,7 @@ def test_distances_are_the_dense_fields_and_features_the_tables():
     found, wanted = field.sample(points), dense.sample(points)
     assert torch.equal(found.sdf, wanted.sdf)
     assert torch.equal(found.gradient, wanted.gradient)
-    levels = field.encoding.levels
+    levels = field.levels
     table = encode_hash(field.features, points, levels.lower, levels.upper, levels.voxel_sizes)
     for level in range(COUNT):
         for k in range(PER_LEVEL):
@@ -62,9 +70,7 @@ def test_held_channels_get_no_gradient():
     points = torch.rand(100, 3) - 0.5
     field.features_at(points).square().sum().backward()
     whole = field.features.grad.to_dense()
-    field.encoding.hold_channels_(
-        COUNT + 1
-    )  # the first of each level, and the second of the coarsest
+    field.hold_channels_(COUNT + 1)  # the first of each level, and the second of the coarsest
     held = field.features.grad.to_dense().view(COUNT, ROWS, PER_LEVEL)
     whole = whole.view(COUNT, ROWS, PER_LEVEL)
     assert (held[:, :, 0] == 0).all()
@@ -80,7 +86,7 @@ def test_tables_may_be_smaller():
     field.features_at(torch.rand(500, 3) - 0.5).sum().backward()
     touched = field.features.grad.coalesce().indices()[0]
     assert touched.max() < COUNT * 2**10
-    field.encoding.hold_channels_(COUNT)
+    field.hold_channels_(COUNT)
     held = field.features.grad.to_dense().view(COUNT, -1, PER_LEVEL)
     assert (held[:, :, 0] == 0).all()
     assert all(level.any() for level in held[:, :, 1])
@@ -90,7 +96,7 @@ def test_tables_may_be_smaller():
 def test_rows_near_are_all_that_points_near_the_surface_read(finest):
     field = ball()
     levels = replace(Levels.of(field.bounds(), finest * field.voxel_size, 4), rows=2**14)
-    field = Field(field.distances, HashFeatures(levels))
+    field = HashField(field.distances, levels)
     near = field.rows_near(1.5 * field.voxel_size)
     g = torch.Generator().manual_seed(0)
     direction = torch.nn.functional.normalize(torch.randn(1_000_000, 3, generator=g))
@@ -130,7 +136,7 @@ def test_smoothing_leaves_the_table():
     field = ball()
     before = field.features.detach().clone()
     field.features_at(torch.rand(10, 3)).sum().backward()
-    field.encoding.smooth_(field.distances, torch.arange(10), 0.1)
+    field.smooth_features_(torch.arange(10), 0.1)
     assert torch.equal(field.features, before)
 
 

@@ -17,8 +17,7 @@ from plain import plain_stage, plain_training, small_scene
 from univoxel.cli.trainer import train
 from univoxel.config import LossConfig
 from univoxel.data import load_photos
-from univoxel.fields.features import Levels
-from univoxel.fields.field import dense_field, hash_field
+from univoxel.fields.field import Levels, dense_field, hash_field
 from univoxel.fields.grid import fit_grid
 from univoxel.lights.base import Regularisation
 from univoxel.preparation.hull import mask_distances, visual_hull

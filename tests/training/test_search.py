@@ -7,8 +7,7 @@ import torch
 from analytic import photos_of, sphere_scene
 from spare_scene import LIGHT, feature_scene, heads, reference_of_two_views
 
-from univoxel.fields.features import Levels
-from univoxel.fields.field import hash_field
+from univoxel.fields.field import Levels, hash_field
 from univoxel.fields.grid import fit_grid
 from univoxel.scene import Scene, SceneConfig, load_scene, save_scene
 from univoxel.training import compression

@@ -5,7 +5,7 @@ import torch
 from analytic import sphere_scene
 from spare_scene import feature_scene, reference_of_two_views
 
-from univoxel.fields.features import FEWEST_ROWS, ROWS
+from univoxel.fields.field import FEWEST_ROWS, ROWS
 from univoxel.fields.grid import fit_grid
 from univoxel.scene import SceneConfig, save_scene
 from univoxel.training import compression

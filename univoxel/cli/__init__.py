@@ -183,12 +183,8 @@ def shown(result: parsing.Result) -> int:
 
 
 def understood(arguments: Sequence[str]) -> Call | None:
-    """The call that arguments ask for; None: help was asked for and printed.
-
-    Raises:
-        Usage: they make no command.
-        MissingExtra: one of the experiments, which is not there.
-    """
+    """The call that arguments ask for; None: help was asked for and printed. Raises Usage if they
+    make no command, and errors of `laboratory`."""
     match arguments:
         case [name, *_] if name in LABORATORY:
             return parsing.parse(arguments, laboratory(), f"{LAB} ")
@@ -312,11 +308,8 @@ class _Plain(logging.Handler):
 
 @contextlib.contextmanager
 def spoken(common: Common, results_alone: bool) -> Iterator[None]:
-    """Print what the package logs while a command runs.
-
-    Args:
-        results_alone: on stdout; all else goes to stderr.
-    """
+    """Print what the package logs while a command runs; on stderr, if results stand alone on
+    stdout."""
     handler, level = _Plain(common, results_alone), log.level
     log.addHandler(handler)
     chosen = logging.WARNING if common.quiet else logging.DEBUG if common.verbose else logging.INFO

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from univoxel.cli import parsing
+from univoxel.cli.train import TrainOptions
 from univoxel.core import choices, log, machine
 from univoxel.core.files import read_json
-from univoxel.errors import ProcessFailed, UserError
+from univoxel.errors import ProcessFailed, UserError, demand
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -60,21 +61,9 @@ class BatchOptions:
 
     def training(self) -> TrainConfig:
         """The configuration of a training; a UserError if there is none of that kind."""
-        from univoxel.config import load_config
-        from univoxel.core.validation import changed
-        from univoxel.presets import chosen
-
-        if self.config is None:
-            config = chosen(self.preset, self.minutes, Path(), Path(), self.light)
-            return changed(config, self.changes)
-        if (self.preset, self.light) != ("auto", "hybrid"):
-            raise UserError(
-                f"config cannot be combined with preset or light: {self.config} sets both",
-                *("config", "preset", "light"),
-            )
-        config = load_config(self.config)
-        minutes = config.minutes if self.minutes is None else self.minutes
-        return changed(replace(config, minutes=minutes), self.changes)
+        names = "preset", "light", "minutes", "config", "changes"
+        chosen = {name: getattr(self, name) for name in names}
+        return TrainOptions(data=Path(), out=Path(), **chosen).configuration()
 
     def identity(self, data: Path) -> dict[str, Any]:
         """What a later sitting must agree with to continue; JSON. Steps may be added."""
@@ -136,8 +125,7 @@ def batch(asked: BatchOptions, threads: int | None = None) -> list[SceneResult]:
     numbers = {"jobs": asked.jobs, "threads": threads}
     numbers |= {"tries": asked.tries, "samples": asked.samples}
     for name, number in numbers.items():
-        if number is not None and number < 1:
-            raise UserError(f"{name} must be at least 1, got {number}", name)
+        demand(number is None or number >= 1, name, "at least 1", number)
     known, config = named(asked.scenes), asked.training()
     jobs, out = asked.jobs, asked.out
     if asked.scheduler is None:

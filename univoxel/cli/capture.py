@@ -171,8 +171,7 @@ def capture(
     asked = CaptureOptions(Path(photographs), Path(out), **options)
     if asked.until != "page":
         raise UserError(
-            f"until must be page, got {asked.until}: to stop earlier, call `find_data`",
-            "until",
+            f"until must be page, got {asked.until}: to stop earlier, call `find_data`", "until"
         )
     given, project = look_at(asked.photographs), Project(asked.out)
     training = chosen(asked.preset, asked.minutes, project.cut, project.run, asked.light)

@@ -33,12 +33,7 @@ class DemoOptions:
 
 @takes(DemoOptions)
 def command(asked: DemoOptions) -> Path:
-    """Train, evaluate and relight the bundled scene in a few minutes.
-
-    Raises:
-        OSError: `out` cannot be written.
-        UserError: `out` contains a run that cannot be read.
-    """
+    """Train, evaluate and relight the bundled scene in a few minutes."""
     from univoxel.cli.trainer import train
     from univoxel.config import StageConfig
     from univoxel.evaluation.measures import in_words

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from univoxel.cli.parsing import DataOf, Run, takes, written
 from univoxel.core import log
 from univoxel.core.choices import Detailing
-from univoxel.errors import UserError
+from univoxel.errors import UserError, demand
 
 if TYPE_CHECKING:
     from univoxel.data import Photos
@@ -24,11 +24,7 @@ MOST_OF_LIMIT = 0.25  # of the minutes that a training has
 
 @dataclass(frozen=True)
 class DetailOptions:
-    """Photographs and size of the texture.
-
-    Raises:
-        UserError: size out of range.
-    """
+    """Photographs and size of the texture; a UserError for a size out of range."""
 
     run: Run
     """folder of a trained run"""
@@ -38,11 +34,9 @@ class DetailOptions:
     """width of the square texture, a power of 2 from 256 to 8192"""
 
     def __post_init__(self) -> None:
-        low, high = DETAIL_SIZES
-        if self.size is not None and (not low <= self.size <= high or self.size & (self.size - 1)):
-            raise UserError(
-                f"detail: size must be a power of 2 from {low} to {high}, got {self.size}", "size"
-            )
+        (low, high), size = DETAIL_SIZES, self.size
+        fits = size is None or (low <= size <= high and not size & (size - 1))
+        demand(fits, "size", f"a power of 2 from {low} to {high}", size)
 
 
 @takes(DetailOptions)
@@ -108,11 +102,7 @@ def seconds_for(photos: Photos, detail: Detailing, threads: int) -> float:
 def made_after_training(
     scene: Scene, photos: Photos, run: Path, detail: Detailing, until: float | None
 ) -> Path | None:
-    """`write`, where a configuration asks for it.
-
-    Args:
-        until: time of `time.monotonic` at which training must have ended; None: there is no limit.
-    """
+    """`write`, where a configuration asks for it and `time.monotonic` is not past `until`."""
     if detail == "none":
         return None
     if until is not None and time.monotonic() > until:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from univoxel.cli.parsing import File, LightOf, Run, takes, written
 from univoxel.core.choices import MAP_ROWS
-from univoxel.errors import UserError
+from univoxel.errors import UserError, demand
 
 if TYPE_CHECKING:
     from univoxel.evaluation.recovered_map import Comparison
@@ -70,8 +70,7 @@ def envmap(asked: EnvmapOptions) -> Comparison | None:
 
     run, out = Path(asked.run), Path(asked.out)
     height = asked.height
-    if height < 1:
-        raise UserError(f"height must be at least 1, got {height}", "height")
+    demand(height >= 1, "height", "at least 1", height)
     if out.suffix.lower() not in (".exr", ".hdr"):
         raise UserError(f"out: expected a name that ends in .exr or .hdr, got {out}", "out")
     scene = load_scene(run)

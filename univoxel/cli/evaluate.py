@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from univoxel.cli import parsing
 from univoxel.core.choices import BOUNCES, SAMPLES, Behind
 from univoxel.core.files import write_json
-from univoxel.errors import UserError
+from univoxel.errors import UserError, demand
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -17,11 +17,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class EvaluateOptions:
-    """How a run is measured.
-
-    Raises:
-        UserError: samples or bounces out of range; both light_of and fit_light.
-    """
+    """How a run is measured; a UserError for an option out of range, or two that exclude each
+    other."""
 
     run: parsing.Run
     """folder of a trained run"""
@@ -47,13 +44,8 @@ class EvaluateOptions:
     """also measure novel views at full size, with the full-size texture of the run"""
 
     def __post_init__(self) -> None:
-        if self.samples < 1 or self.bounces < 0:
-            raise UserError(
-                "evaluate: expected samples >= 1 and bounces >= 0, got "
-                f"samples={self.samples} and bounces={self.bounces}",
-                "samples",
-                "bounces",
-            )
+        demand(self.samples >= 1, "samples", "at least 1", self.samples)
+        demand(self.bounces >= 0, "bounces", "at least 0", self.bounces)
         if self.fit_light and self.light_of is not None:
             raise UserError("expected light_of or fit_light, but not both", "light_of", "fit_light")
 
@@ -99,14 +91,7 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
     from statistics import fmean
 
     from univoxel.detail.views import detailed_views, measure_full_size
-    from univoxel.evaluation import views
-    from univoxel.evaluation.measures import (
-        albedo_scales,
-        every_nth,
-        load_scene_truth,
-        mesh_chamfer,
-        rank_correlation,
-    )
+    from univoxel.evaluation import measures
     from univoxel.render.pipeline import extract_mesh
     from univoxel.run import load_verdict, photos_of
     from univoxel.scene import FILE, load_checkpoint
@@ -116,29 +101,29 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
     data, save, json = (None if path is None else Path(path) for path in paths)
     photos = photos_of(run, data)
     if asked.test_every is not None:
-        photos = every_nth(photos, photos_of(run, data, "train").names, asked.test_every)
-    truth = load_scene_truth(photos)
+        photos = measures.every_nth(photos, photos_of(run, data, "train").names, asked.test_every)
+    truth = measures.load_scene_truth(photos)
     scene, report = load_checkpoint(run)
     scene.show_light_of(asked.light_of)
     for folder in (save, json and json.parent):
         if folder:
             folder.mkdir(parents=True, exist_ok=True)
 
-    surveyed = views.survey_of(scene, run, data)
+    surveyed = measures.survey_of(scene, run, data)
     mesh = extract_mesh(scene) if truth.maps or truth.points is not None else None
     detailed = detailed_views(scene, run, data)
     near = None if detailed is None else detailed.detail.near
-    scales = albedo_scales(scene, photos, near)
-    relighting = views.relighting_of(scene, mesh, truth, scales, asked.samples, asked.bounces)
+    scales = measures.albedo_scales(scene, photos, near)
+    relighting = measures.relighting_of(scene, mesh, truth, scales, asked.samples, asked.bounces)
     how = {"background": asked.background, "fit_light": asked.fit_light, "save": save}
     how |= {"albedo_near": near, "novel": detailed and detailed.render}
-    found = views.measure_views(scene, photos, truth, scales, relighting, surveyed, **how)
+    found = measures.measure_views(scene, photos, truth, scales, relighting, surveyed, **how)
     result = {key: fmean(values) if values else None for key, values in found.measures.items()}
     result |= {
-        "chamfer": mesh_chamfer(mesh, truth.points),
-        "trust_spearman": rank_correlation(found.errors["albedo"]),
-        "trust_spearman_roughness": rank_correlation(found.errors["roughness"]),
-        "trust_spearman_normal": rank_correlation(found.errors["normal"]),
+        "chamfer": measures.mesh_chamfer(mesh, truth.points),
+        "trust_spearman": measures.rank_correlation(found.errors["albedo"]),
+        "trust_spearman_roughness": measures.rank_correlation(found.errors["roughness"]),
+        "trust_spearman_normal": measures.rank_correlation(found.errors["normal"]),
         "train_seconds": report.get("seconds"),
         "threads": report.get("threads"),
         "peak_rss_mb": report.get("peak_rss_mb"),
@@ -147,7 +132,7 @@ def evaluate(asked: EvaluateOptions) -> dict[str, float | int | None]:
     }
     if asked.full_size:
         result |= measure_full_size(scene, detailed, photos, save, asked.fit_light)
-    figures = views.say_trust(surveyed, report.get("troubles", []), save)
+    figures = measures.say_trust(surveyed, report.get("troubles", []), save)
     if json:
         verdict = load_verdict(run)
         came = {"complete": verdict and verdict.complete, "verdict": verdict and verdict.word}

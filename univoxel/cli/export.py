@@ -10,7 +10,7 @@ from typing import Annotated
 from univoxel.cli.parsing import ADVANCED, File, Run, takes, written
 from univoxel.core import choices
 from univoxel.core.files import write_bytes
-from univoxel.errors import UserError
+from univoxel.errors import UserError, demand
 
 SUFFIXES = (".glb", ".obj", ".ply", ".usdz")
 TEXTURED_FACES = 20_000  # of textured meshes: the texture holds what they are too coarse for
@@ -23,11 +23,7 @@ LEAST_FACES = 32  # of the coarsest level: with fewer no shape is left
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """How a surface becomes a file.
-
-    Raises:
-        UserError: an argument is out of range.
-    """
+    """How a surface becomes a file; a UserError for an option out of range."""
 
     run: Run
     """folder of a trained run"""
@@ -53,26 +49,18 @@ class ExportOptions:
     """also write N coarser meshes, each with 1/4 of the triangles of the one before"""
 
     def __post_init__(self) -> None:
-        if self.faces is not None and self.faces < 4:
-            raise UserError(f"export: faces must be at least 4, got {self.faces}", "faces")
-        low, high = TEXTURE_SIZES
-        size = self.texture_size
-        if size is not None and (not low <= size <= high or size & (size - 1)):
-            raise UserError(
-                f"export: texture_size must be a power of 2 from {low} to {high}, got {size}",
-                "texture_size",
-            )
-        for name, known in (
-            ("texture_format", choices.TEXTURE_FORMATS),
-            ("origin", choices.ORIGINS),
-        ):
-            if (value := getattr(self, name)) not in known:
-                raise UserError(f"export: {name} must be {' or '.join(known)}, got {value}", name)
-        for name, (low, high) in (("quality", QUALITIES), ("lods", LODS)):
-            if not low <= (value := getattr(self, name)) <= high:
-                raise UserError(f"export: {name} must be from {low} to {high}, got {value}", name)
-        if self.size is not None and not 0 < self.size < math.inf:
-            raise UserError(f"export: size must be above 0, got {self.size:g}", "size")
+        demand(self.faces is None or self.faces >= 4, "faces", "at least 4", self.faces)
+        (low, high), texels = TEXTURE_SIZES, self.texture_size
+        fits = texels is None or (low <= texels <= high and not texels & (texels - 1))
+        demand(fits, "texture_size", f"a power of 2 from {low} to {high}", texels)
+        words = {"texture_format": choices.TEXTURE_FORMATS, "origin": choices.ORIGINS}
+        for name, known in words.items():
+            value = getattr(self, name)
+            demand(value in known, name, " or ".join(known), value)
+        for name, (low, high) in {"quality": QUALITIES, "lods": LODS}.items():
+            value = getattr(self, name)
+            demand(low <= value <= high, name, f"from {low} to {high}", value)
+        demand(self.size is None or 0 < self.size < math.inf, "size", "above 0", self.size)
         if self.faces is not None and self.lods:
             require_levels(self.faces, self.lods)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from univoxel.cli.parsing import File, LightOf, Run, takes, written
 from univoxel.core.choices import MAP_ROWS
-from univoxel.errors import UserError
+from univoxel.errors import UserError, demand
 
 MIN_OPACITY = 0.5  # of a pixel that has a surface
 
@@ -63,8 +63,7 @@ def inspect(asked: InspectOptions) -> Path:
     run, height = Path(asked.run), asked.height
     out = None if asked.out is None else Path(asked.out)
     pixel = parse_pixel(asked.pixel) if isinstance(asked.pixel, str) else asked.pixel
-    if height < 1:
-        raise UserError(f"inspect: height must be at least 1, got {height}", "height")
+    demand(height >= 1, "height", "at least 1", height)
     if out is not None and out.suffix.lower() != ".png":
         raise UserError(f"out: expected a name that ends in .png, got {out}", "out")
     scene = load_scene(run)

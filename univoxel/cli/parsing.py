@@ -33,7 +33,7 @@ from typing import (
 )
 
 from univoxel.core.choices import Box, Downscale
-from univoxel.errors import UserError
+from univoxel.errors import demand
 
 # What a command returns is printed, if it is a file or several; a number is the exit code
 Result: TypeAlias = int | Path | Sequence[Path] | None
@@ -75,8 +75,7 @@ Scenes: TypeAlias = Annotated[
     tuple[Path, ...], Written("SCENE [SCENE ...]", "(required)", positional=True)
 ]
 Changes: TypeAlias = Annotated[
-    tuple[str, ...],
-    Written("FIELD=VALUE", "(repeatable)", "set", repeatable=True, advanced=True),
+    tuple[str, ...], Written("FIELD=VALUE", "(repeatable)", "set", repeatable=True, advanced=True)
 ]
 Minutes: TypeAlias = Annotated[float | None, written("MINUTES", "none")]
 ConfigFile: TypeAlias = Annotated[Path | None, written("FILE", "from --preset", advanced=True)]
@@ -124,8 +123,7 @@ def parse(
     """The call that arguments ask for; None: help was asked for and printed.
 
     Args:
-        commands: by name.
-        prefix: what is before their names.
+        commands: by name, without the prefix.
 
     Raises:
         Usage: they make no command.
@@ -206,11 +204,8 @@ def documentation(command: Command) -> str:
 
 
 def meanings(record: type) -> dict[str, str]:
-    """What is under each field of a record, in one line; nothing if there is no source.
-
-    Args:
-        record: a class that is in one file with its bases.
-    """
+    """What is under each field of a record, in one line; nothing if there is no source. A record is
+    in one file with its bases."""
     try:
         tree = ast.parse(inspect.getsource(sys.modules[record.__module__]))
     except OSError:
@@ -332,11 +327,8 @@ def overview(title: str, groups: Mapping[str, Mapping[str, Command]], end: str) 
 
 
 def completion(shell: Shell, commands: Mapping[str, Command], lab: Mapping[str, Command]) -> str:
-    """The script that makes a shell complete commands, options and their choices.
-
-    Args:
-        lab: commands of the experiments; empty if they are not available.
-    """
+    """The script that makes a shell complete commands, those of the experiments if there are any,
+    options and their choices."""
 
     import tyro
     from tyro.conf import ConsolidateSubcommandArgs, FlagCreatePairsOff, OmitSubcommandPrefixes
@@ -384,14 +376,12 @@ def json_file(asked: File | None) -> Iterator[File | None]:
 
 def check_minutes(minutes: float | None) -> None:
     """Refuse, by a UserError, a limit that is not above 0."""
-    if minutes is not None and not minutes > 0:
-        raise UserError(f"minutes must be above 0, got {minutes:g}", "minutes")
+    demand(minutes is None or minutes > 0, "minutes", "above 0", minutes)
 
 
 def check_downscale(downscale: Downscale) -> int:
     """The side of the squares of pixels that become one, 0 for auto; a UserError below 1."""
     if downscale == "auto":
         return 0
-    if downscale < 1:
-        raise UserError(f"downscale must be at least 1, got {downscale}", "downscale")
+    demand(downscale >= 1, "downscale", "at least 1", downscale)
     return downscale

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from univoxel.cli.parsing import ADVANCED, takes, written
 from univoxel.core.choices import FEATURE_SIZE, KEEP_SIZE
-from univoxel.errors import UserError
+from univoxel.errors import demand
 
 
 @dataclass(frozen=True)
@@ -45,10 +45,8 @@ def command(asked: PosesOptions) -> Path:
     from univoxel.capture.config import DEFAULTS, FAST
     from univoxel.capture.poses import poses
 
-    if asked.keep_size < 0:
-        raise UserError(f"--keep-size must be at least 0, got {asked.keep_size}")
-    if asked.every is not None and not asked.every > 0:
-        raise UserError(f"--every must be above 0, got {asked.every:g}")
+    demand(asked.keep_size >= 0, "keep_size", "at least 0", asked.keep_size)
+    demand(asked.every is None or asked.every > 0, "every", "above 0", asked.every)
     config = replace(FAST if asked.fast else DEFAULTS, size=asked.size, seed=asked.seed)
     if asked.features is not None:
         config = replace(config, features=asked.features)

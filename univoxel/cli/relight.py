@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from univoxel.cli.parsing import ADVANCED, Run, takes, written
 from univoxel.core.choices import BOUNCES, ELEVATION, SAMPLES, Animation, Background, Ground
-from univoxel.errors import UserError
+from univoxel.errors import UserError, demand
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -38,11 +38,7 @@ class Where:
 
 @dataclass(frozen=True, kw_only=True)
 class RelightOptions:
-    """How images are relit.
-
-    Raises:
-        UserError: a number is out of range.
-    """
+    """How images are relit; a UserError for a number out of range."""
 
     # In the library the first four may be objects too: `Sun`, `PointLight`, `Cameras`, a number
     suns: Annotated[
@@ -79,12 +75,9 @@ class RelightOptions:
     """background of the images"""
 
     def __post_init__(self) -> None:
-        if not math.isfinite(self.rotate):
-            raise UserError(f"relight: rotate must be finite, got {self.rotate}", "rotate")
-        if not 0 <= self.exposure < math.inf:
-            raise UserError(
-                f"relight: exposure must be finite and at least 0, got {self.exposure}", "exposure"
-            )
+        demand(math.isfinite(self.rotate), "rotate", "finite", self.rotate)
+        bright = 0 <= self.exposure < math.inf
+        demand(bright, "exposure", "finite and at least 0", self.exposure)
 
     def quality(self) -> Quality:
         """How a frame is rendered; a ground at the lowest point is left to the mesh. Numbers out of
@@ -96,12 +89,8 @@ class RelightOptions:
         return Quality(self.samples, self.noise, self.bounces, self.background, ground)
 
     def lighting(self, envmap: str | Path | EnvMap | None) -> Lighting:
-        """All light, that of a map too, if there is one.
-
-        Raises:
-            DataError: the map cannot be used; the message names its file.
-            UserError: there is no light, or a number is out of range.
-        """
+        """All light, that of a map too, if there is one. A UserError if there is none, or a number
+        or the map cannot be used."""
         from univoxel.output.viewpoints import lighting
 
         suns = [sun_light(values) for values in self.suns]
@@ -148,11 +137,8 @@ def command(asked: Relight) -> Path:
 
 
 def sun_light(values: tuple[float, ...] | Sun) -> Sun:
-    """A white sun from azimuth and elevation in degrees, irradiance and, perhaps, its angle.
-
-    Raises:
-        UserError: not 3 or 4 numbers, or one out of range.
-    """
+    """A white sun from azimuth and elevation in degrees, irradiance and, perhaps, its angle; a
+    UserError for other numbers."""
     from univoxel.ops import Sun
     from univoxel.sphere import direction_at
 

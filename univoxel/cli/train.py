@@ -63,12 +63,8 @@ class TrainOptions:
     """change one configuration field, such as loss.radiance=0.5; repeatable"""
 
     def configuration(self) -> TrainConfig:
-        """What they amount to.
-
-        Raises:
-            UserError: an option is out of range; the file of a configuration cannot be read, or a
-                choice was made that it makes itself.
-        """
+        """What they amount to; a UserError for an option out of range, a file that cannot be read,
+        or a choice that the file makes itself."""
         from univoxel.core.validation import changed
 
         parsing.check_minutes(self.minutes)

@@ -24,8 +24,7 @@ from univoxel.data import Photos, keep_photos, load_photos
 from univoxel.data.path_sandbox import FEWEST
 from univoxel.errors import Cancelled, DataError, ExistingFile, UserError
 from univoxel.evaluation.confidence import REPORT_POINTS, Survey, numbers, survey, words
-from univoxel.fields.features import PER_LEVEL, Levels
-from univoxel.fields.field import Field, dense_field, hash_field
+from univoxel.fields.field import PER_LEVEL, Field, Levels, dense_field, hash_field
 from univoxel.fields.grid import fit_grid
 from univoxel.ops import native
 from univoxel.output.timelapse import Timelapse
@@ -71,11 +70,8 @@ def train(
     Raises:
         MissingExtra: view without viser.
         MissingNative: the compiled extension is missing or was built without Embree.
-        DataError: input that cannot be used.
-        ExistingFile: cfg.out already contains a run and resume is False.
+        UserError: data, checkpoint or options cannot be used, or need more memory than there is.
         OSError: a file of the run cannot be written; what was there before stays.
-        UserError: with resume, the checkpoint cannot be read, or it belongs to another
-            configuration; or training needs more memory than there is; or the port is taken.
     """
     if not native.reference_asked():
         native.require_embree("train")  # now, and not minutes later
@@ -188,10 +184,7 @@ def ready(
 def build_scene(prepared: Prepared, cfg: config.TrainConfig) -> Scene:
     """A scene whose surface is the carved hull, with poses and gains as far as they are known.
 
-    Draws the first weights from torch's generator.
-
-    Raises:
-        UserError: cfg.budget_mb is too small for any such scene.
+    Draws the first weights from torch's generator. A UserError if cfg.budget_mb is too small.
     """
     silhouettes, varying = prepared.silhouettes, prepared.varying
     lower, upper = silhouettes.box
@@ -230,11 +223,8 @@ def build_field(prepared: Prepared, cfg: config.TrainConfig) -> Field:
 
 
 def resumed(cfg: config.TrainConfig) -> tuple[Scene, dict[str, Any]] | None:
-    """The scene that a run continues with, and its state; None if nothing was saved yet.
-
-    Raises:
-        UserError: the checkpoint cannot be read, or it belongs to another configuration.
-    """
+    """The scene that a run continues with, and its state; None if nothing was saved yet. A
+    UserError if the run cannot be read, or is of another configuration."""
     if not (cfg.out / FILE).is_file():
         log.info(f"{cfg.out}: nothing has been saved yet, so training starts from the beginning")
         return None

@@ -35,11 +35,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def write_bytes(path: str | Path, data: bytes | memoryview) -> None:
-    """Write a file, whole or not at all.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write a file, whole or not at all; an OSError if it cannot be."""
     with replacing(path) as temporary:
         temporary.write_bytes(data)
 
@@ -55,11 +51,7 @@ def write_json(path: str | Path, value: Any) -> None:
 
 
 def append_line(path: Path, line: str) -> None:
-    """Append a line to a file, whole or not at all.
-
-    Raises:
-        OSError: the file cannot be written; it is as it was.
-    """
+    """Append a line to a file, whole or not at all; an OSError if it cannot be."""
     before = path.stat().st_size if path.exists() else 0
     try:
         with path.open("ab", buffering=0) as file:
@@ -121,13 +113,10 @@ def recorded(folder: Path, step: str) -> Any:
 def done(
     folder: Path, step: str, fingerprint: Any, refusal: Callable[[Any], ExistingFile] | None = None
 ) -> bool:
-    """Whether a step is done.
+    """Whether a step is done; an ExistingFile if it was with another fingerprint.
 
     Args:
-        refusal: makes the error of the fingerprint that it was done with.
-
-    Raises:
-        ExistingFile: it was done with another fingerprint.
+        refusal: makes the error of the other fingerprint.
     """
     before = recorded(folder, step)
     if before is None or before == as_json(fingerprint):

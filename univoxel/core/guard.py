@@ -41,11 +41,7 @@ runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
 
 def command(arguments: Sequence[str]) -> list[str]:
     """The command line of a Python process that runs this package and imports nothing from the
-    working folder; it ends with this process.
-
-    Args:
-        arguments: for Python; they begin with -m MODULE or -c PROGRAM.
-    """
+    working folder; it ends with this process. The arguments begin with -m MODULE or -c PROGRAM."""
     packages = dict.fromkeys(name.partition(".")[0] for name in (__name__, arguments[1]))
     files = [f"{p}={sys.modules[p].__file__}" for p in packages if p in sys.modules]
     kind, what, *rest = arguments
@@ -68,7 +64,6 @@ def guarded(
     """A process of `command`, which ends with the block at the latest.
 
     Args:
-        arguments: as in `command`.
         output: takes all that it says.
         options: more of Popen's.
     """

@@ -24,12 +24,7 @@ DARK_STYLE = "body { font: 15px/1.4 sans-serif; margin: 2em; background: #202020
 def document(
     title: str, style: str, body: str, policy: str = POLICY, viewport: str = VIEWPORT
 ) -> str:
-    """A whole page.
-
-    Args:
-        body: HTML, as all but the title.
-        policy: what a browser lets the page load and run.
-    """
+    """A whole page. Its body is HTML; policy is what a browser lets it load and run."""
     return f"""<!doctype html>
 <html lang="en">
 <meta charset="utf-8">
@@ -55,11 +50,7 @@ def paragraph(text: str) -> str:
 def table(
     rows: Iterable[Sequence[str]], head: Sequence[str] = (), kinds: Iterable[str] | None = None
 ) -> str:
-    """A table of cells of HTML.
-
-    Args:
-        kinds: a class for each row.
-    """
+    """A table of cells of HTML, with a class for each row if there are kinds."""
     rows = list(rows)
     opened = [f'<tr class="{kind}">' for kind in kinds] if kinds else ["<tr>"] * len(rows)
     heads = "<tr>" + "".join(f"<th>{cell}" for cell in head) if head else ""

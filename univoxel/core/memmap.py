@@ -64,10 +64,7 @@ def zeros(shape: Sequence[int], dtype: torch.dtype) -> Tensor:
 
 def reserve(descriptor: int, size: int, place: Path) -> None:
     """Make an open file as long, on the disk too: where that is full later, the process would end.
-
-    Args:
-        place: that an OSError names if there is no room.
-    """
+    An OSError, which names the place, if there is no room."""
     try:
         system.reserve(descriptor, size)
     except OSError as error:
@@ -77,10 +74,7 @@ def reserve(descriptor: int, size: int, place: Path) -> None:
 
 
 def mapped(path: Path, offset: int, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
-    """An array in a file, which is changed with it.
-
-    Args:
-        offset: bytes before it.
+    """An array in a file, from a number of bytes on, which is changed with it.
 
     Raises:
         ValueError: the offset is no multiple of the bytes of a number, or the file is too short.

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 HALF_MAX = 65504.0  # the largest number of half precision
-# Linear albedo [N, 3] of points of the surface [N, 3], of their unit normals [N, 3], the field's
-# albedo there [N, 3], and the width in world units of what is asked for
+# Linear albedo [N, 3] in place of the field's: of points of the surface [N, 3], their unit normals
+# [N, 3], the field's albedo there [N, 3], and the width in world units of what is asked for
 AlbedoNear: TypeAlias = Callable[[Tensor, Tensor, Tensor, float], Tensor]
 
 

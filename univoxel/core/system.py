@@ -39,11 +39,8 @@ F_PREALLOCATE, F_ALLOCATEALL, F_PEOFPOSMODE, F_FULLFSYNC = 42, 4, 3, 51  # of ma
 
 
 def replace(source: Path, target: Path) -> None:
-    """Give a file the name of another, which is gone then: whoever looks sees one of the two.
-
-    Raises:
-        OSError: it cannot be; on Windows also where another program keeps the other file open.
-    """
+    """Give a file the name of another, which is gone then: whoever looks sees one of the two. An
+    OSError if it cannot be; on Windows also where another program keeps the other file open."""
     end = time.monotonic() + REPLACED_WITHIN
     while True:
         try:

@@ -101,11 +101,8 @@ def setting(default: T, meaning: str, **rest: Any) -> T:
 
 
 def check_settings(config: Any) -> None:
-    """Refuse a configuration with a number out of its field's range, or a word that is no choice.
-
-    Raises:
-        ConfigError: names class and field, says what is wanted and what came.
-    """
+    """Refuse, by a ConfigError, a configuration with a number out of its field's range, or a word
+    that is no choice."""
     hints = _hints(type(config))
     for field in _fields(config):
         said = field.metadata.get("setting", Setting(""))
@@ -142,7 +139,6 @@ def check_fields(config: object, wanted: str, holds: Callable[[Any], bool], *nam
     """Refuse, as `check_settings` does, a configuration whose named fields are not as wanted.
 
     Args:
-        config: a dataclass.
         wanted: the range in words, such as "at least 1".
         holds: whether a value is in it; a TypeError or UnicodeError counts as no.
     """
@@ -235,11 +231,8 @@ def _has_fields(kind: Any, value: Any) -> bool:
 
 
 def changed(config: Any, changes: Iterable[str]) -> Any:
-    """A frozen config with fields replaced: changes are "field.field=value".
-
-    Raises:
-        ConfigError: no such field, or a value of another type than the field has.
-    """
+    """A frozen config with fields replaced: changes are "field.field=value". A ConfigError if there
+    is no such field, or the value is of another type."""
     for change in changes:
         path, equals, text = change.partition("=")
         if not equals:

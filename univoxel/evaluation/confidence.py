@@ -47,14 +47,10 @@ from univoxel.sphere import fibonacci_sphere, gaps, side_of
 POINTS = 20_000  # of the surface that evaluation surveys, for its maps of expected errors
 REPORT_POINTS = 2_000  # of the surface that are surveyed after training, for words only
 
-# Observations of a point that are rendered again, at most
-OBSERVATIONS = 8
-# Directions that visibility is measured in where the scene has no map with its own
-DIRECTIONS = 64
-# Roughness over which the slope of the render is taken
-ROUGHNESS_STEP = 0.05
-# Views straight from above with which a place counts as half seen
-ENOUGH_VIEWS = 3.0
+OBSERVATIONS = 8  # of a point that are rendered again, at most
+DIRECTIONS = 64  # directions that visibility is measured in where the scene has no map with its own
+ROUGHNESS_STEP = 0.05  # roughness over which the slope of the render is taken
+ENOUGH_VIEWS = 3.0  # views straight from above with which a place counts as half seen
 # sRGB; disagreement with the photographs with which they count as half agreeing
 NOISE = 0.02
 # sRGB; darker pixels are noise
@@ -141,14 +137,8 @@ class Survey:
 
 @torch.no_grad()
 def survey(scene: Scene, photos: Photos, points: int) -> Survey:
-    """How well the training photographs determine points of the surface.
-
-    Args:
-        points: how many, >= 1, spread evenly.
-
-    Raises:
-        ValueError: the scene has no surface.
-    """
+    """How well the training photographs determine points of the surface, spread evenly; a
+    ValueError if the scene has none."""
     generator = torch.Generator().manual_seed(0)
     photos = scene.registered(photos)
     mesh, tracer, offset = extract_mesh(scene), scene.occluder(), scene.field.voxel_size
@@ -228,10 +218,7 @@ def spread_observations(observations: Observations, most: int) -> tuple[Tensor, 
 
 
 def compare(
-    scene: Scene,
-    observations: Observations,
-    transport: Transport,
-    which: tuple[Tensor, Tensor],
+    scene: Scene, observations: Observations, transport: Transport, which: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Tensor]:
     """Mean absolute sRGB difference between photographs and render, and root mean square of the
     render's slope by roughness: [P] each; 0 for points without observations.
@@ -310,8 +297,7 @@ def render(
 # Voxels, over 2, that opposite sides of a thin part count as farther apart: a pixel takes its
 # expected error from its own side
 NORMAL_SCALE = 3.0
-# Nearest points that a pixel takes its expected error from
-NEIGHBOURS = 4
+NEIGHBOURS = 4  # nearest points that a pixel takes its expected error from
 
 
 def key_of(position: Tensor, normal: Tensor, voxel_size: float) -> np.ndarray:
@@ -346,17 +332,13 @@ class ExpectedErrors:
 # places were on the tuning half of the bank. No expected roughness is so certain
 GOOD = {"albedo": (0.05, 0.1), "normal": (8.0, 10.0)}
 UNITS = {"albedo": "", "normal": " degrees"}
-# Views; a material that fewer see is reported as a guess
-FEW_VIEWS = 3
-# Degrees of spread; views within are reported as one direction
-ONE_SIDE = 15.0
-# Share of a point's light; where less comes from outside, that is reported
-MIN_VISIBILITY = 0.5
+FEW_VIEWS = 3  # views; a material that fewer see is reported as a guess
+ONE_SIDE = 15.0  # degrees of spread; views within are reported as one direction
+MIN_VISIBILITY = 0.5  # share of a point's light; where less comes from outside, that is reported
 # Mean absolute difference of render and photographs, sRGB; where it is more, that is reported:
 # surface, material or light is wrong
 MAX_DISAGREEMENT = 0.05
-# Share of the surface below which nothing is reported about it
-MIN_SHARE = 0.01
+MIN_SHARE = 0.01  # share of the surface below which nothing is reported about it
 
 
 def numbers(surveyed: Survey) -> dict[str, float]:
@@ -382,11 +364,8 @@ def numbers(surveyed: Survey) -> dict[str, float]:
 
 
 def words(figures: dict[str, float], troubles: list[str]) -> str:
-    """The figures as a paragraph; findings that do not apply are left out.
-
-    Args:
-        troubles: what went wrong in training, from its state.
-    """
+    """The figures as a paragraph, with what went wrong in training; findings that do not apply are
+    left out."""
     sentences = [
         f"Mean expected error of the surface: {figures['albedo_error']:.2f} for the albedo (in "
         f"sRGB), {figures['roughness_error']:.2f} for the roughness, {figures['normal_error']:.0f} "
@@ -429,12 +408,9 @@ def words(figures: dict[str, float], troubles: list[str]) -> str:
 # first, each with those before it taken as photographs. No truth is read.
 
 
-# Directions that are weighed, on the whole sphere
-CANDIDATES = 600
-# Degrees; photographs nearer to one another show much the same
-APART = 25.0
-# Degrees to the nearest photograph; directions beyond are a gap
-GAP = 30.0
+CANDIDATES = 600  # directions that are weighed, on the whole sphere
+APART = 25.0  # degrees; photographs nearer to one another show much the same
+GAP = 30.0  # degrees to the nearest photograph; directions beyond are a gap
 # Degrees below which nobody is sent, unless a photograph was taken from there: things stand on
 # something
 LOWEST = 0.0
@@ -536,7 +512,8 @@ def advise(
         gains.append(float(gain[best]))
         straight = straight + shown[best]
         nearest = torch.minimum(nearest, _degrees(weighed, weighed[best : best + 1])[:, 0])
-    front = _front(taken)
+    # The first photograph that was taken from a side; argmax of none is the first of all
+    front = int((elevations(taken).abs() < STEEP).int().argmax())
     hidden = (surveyed.views == 0) & (shown.amax(0) == 0)
     return Advice(
         taken=taken,
@@ -570,12 +547,6 @@ def _shown(surveyed: Survey, surface: VisibilityScene, eye: Tensor) -> Tensor:
 def _degrees(a: Tensor, b: Tensor) -> Tensor:
     """Angles [A, B] between unit vectors [A, 3] and [B, 3]."""
     return (a @ b.T).clamp(-1, 1).acos().rad2deg()
-
-
-def _front(taken: Tensor) -> int:
-    """The first photograph that was taken from a side."""
-    flat = (elevations(taken).abs() < STEEP).nonzero()[:, 0]
-    return int(flat[0]) if len(flat) else 0
 
 
 def azimuths(direction: Tensor) -> Tensor:

@@ -32,14 +32,8 @@ class Comparison:
 
 @torch.no_grad()
 def recovered_map(scene: Scene, run: Path, height: int) -> Tensor:
-    """The map of a scene [height, 2 height, 3], in the light that it shows.
-
-    Args:
-        run: its folder, for the message.
-
-    Raises:
-        UserError: the scene has none.
-    """
+    """The map of a scene [height, 2 height, 3], in the light that it shows; a UserError, which
+    names the folder of the run, if it has none."""
     sky = scene.environment()
     if sky is None:
         raise UserError(

@@ -190,12 +190,8 @@ class BrickDistances(AbstractDistances):
 
 
 def _nodes(grid: GridShape, flat: Tensor, node_offsets: Tensor) -> Tensor:
-    """World positions [N K, 3] of nodes of bricks.
-
-    Args:
-        flat: [N] numbers of the bricks' places among all of the grid.
-        inside: [K, 3] int64 which nodes of each.
-    """
+    """World positions [N K, 3] of nodes of bricks: those at offsets [K, 3] int64 in each of the
+    bricks with the numbers [N] among all places of the grid."""
     shape = tuple(-(-n // Bricks.SIDE) for n in grid.size)
     node = torch.stack(torch.unravel_index(flat, shape), -1) * Bricks.SIDE
     node = (node[:, None] + node_offsets).reshape(-1, 3)
@@ -253,11 +249,8 @@ def pack_bricks(distances: BrickDistances) -> dict[str, Tensor]:
 
 
 def unpack_bricks(place: Tensor, inside: Tensor, size: tuple[int, int, int]) -> Bricks:
-    """The bricks that `pack_bricks` told of.
-
-    Raises:
-        ValueError, IndexError: they do not fit a grid of this size.
-    """
+    """The bricks that `pack_bricks` told of; a ValueError or IndexError if they do not fit the
+    grid."""
     shape = [-(-n // Bricks.SIDE) for n in size]
     bits = inside[:, None] >> torch.arange(8, dtype=torch.uint8) & 1
     table = bits.flatten()[: shape[0] * shape[1] * shape[2]].to(torch.int32)

@@ -284,11 +284,8 @@ def pack(sdf: Tensor, reach: float) -> dict[str, Tensor]:
 
 
 def unpack(packed: dict[str, Tensor], size: tuple[int, int, int], far: float) -> Tensor:
-    """Distances [X, Y, Z] from what `pack` gave: `far` or minus that where no number is kept.
-
-    Raises:
-        IndexError, ValueError: they do not belong to a grid of this size.
-    """
+    """Distances [X, Y, Z] from what `pack` gave: `far` or minus that where no number is kept. An
+    IndexError or ValueError if they belong to a grid of another size."""
     near = np.zeros(size, bool)
     rows = packed["rows"].long()
     near.reshape(-1)[rows.numpy()] = True

@@ -20,27 +20,14 @@ LightConfig: TypeAlias = (
     SGConfig | SHConfig | MLPLightConfig | EnvmapSGConfig | EnvmapConfig | BakedConfig
 )
 
+# fmt: off
 __all__ = [
-    "AbstractLight",
-    "AbstractLocalLight",
-    "BakedConfig",
-    "BakedLight",
-    "EnvmapConfig",
-    "EnvmapLight",
-    "EnvmapSGConfig",
-    "EnvmapSGLight",
-    "LightConfig",
-    "LocalLightConfig",
-    "LocalMLP",
-    "LocalSG",
-    "LocalSH",
-    "MLPLightConfig",
-    "SGConfig",
-    "SHConfig",
-    "build",
-    "read_config",
+    "AbstractLight", "AbstractLocalLight", "BakedConfig", "BakedLight", "EnvmapConfig",
+    "EnvmapLight", "EnvmapSGConfig", "EnvmapSGLight", "LightConfig", "LocalLightConfig", "LocalMLP",
+    "LocalSG", "LocalSH", "MLPLightConfig", "SGConfig", "SHConfig", "build", "read_config",
     "scaled",
 ]
+# fmt: on
 
 
 def build(

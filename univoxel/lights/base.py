@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -75,11 +75,12 @@ class AbstractLight(nn.Module, ABC):
     """Light that falls on surface points. Declares; a leaf implements each method once."""
 
     traced: ClassVar[bool]  # whether the light is distant, so that `reflected` wants an occlusion
+    config: Any  # with `directions` in training, and `directions_eval`
 
     @property
-    @abstractmethod
     def directions(self) -> int:
         """D, along which `reflected` sums up light: fewer in training mode than in evaluation."""
+        return self.config.directions if self.training else self.config.directions_eval
 
     @abstractmethod
     def incident(
@@ -140,28 +141,30 @@ class AbstractLocalLight(AbstractLight):
 
     traced = False
     config: LocalLightConfig
-    head: MLP  # from `encode` of the surface
-    base: nn.Parameter
 
-    @property
-    def directions(self) -> int:
-        return self.config.directions if self.training else self.config.directions_eval
+    def __init__(
+        self,
+        features: int,
+        config: LocalLightConfig,
+        base: Tensor,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        """
+        Args:
+            features: C of Surface.features, >= 0.
+            base: at first, and all of the light then.
+            generator: draws the head's first weights.
+        """
+        super().__init__()
+        self.config = config
+        sizes = [features + 3 + 6 * FREQUENCIES, *[config.hidden] * config.layers, base.numel()]
+        self.head: MLP = MLP(sizes, generator or torch.default_generator)  # from `encode`
+        nn.init.zeros_(self.head.linear[-1].weight)
+        self.base: nn.Parameter = nn.Parameter(base)
 
-
-def build_head(
-    features: int, hidden: int, layers: int, outputs: int, generator: torch.Generator | None
-) -> MLP:
-    """A network from `encode` to what is added to a global light: at first nothing.
-
-    Args:
-        features: C of Surface.features, >= 0.
-        hidden, layers: width and number of the hidden layers.
-        generator: draws the first weights.
-    """
-    inputs = features + 3 + 6 * FREQUENCIES
-    head = MLP([inputs, *[hidden] * layers, outputs], generator or torch.default_generator)
-    nn.init.zeros_(head.linear[-1].weight)  # the global light is the starting point
-    return head
+    def raw(self, surface: Surface) -> Tensor:
+        """What the head adds to the global light at each point: [N, numbers of `base`]."""
+        return self.head(encode(surface, self.config.scale))
 
 
 def encode(surface: Surface, scale: float) -> Tensor:

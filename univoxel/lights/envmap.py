@@ -14,7 +14,7 @@ from univoxel.core.records import Surface
 from univoxel.core.validation import check_settings, setting
 from univoxel.lights import base, latlong, sg
 from univoxel.lights.base import KIND, MOST_DIRECTIONS, MOST_ROWS, Regularisation
-from univoxel.lights.latlong import AbstractLatLongLight, LatLongConfig
+from univoxel.lights.latlong import AbstractLatLongLight
 from univoxel.sphere import latlong_directions
 
 # The learning rate of networks moves log radiance that much faster: it must reach a sun
@@ -23,7 +23,7 @@ COARSEST = 4  # rows of the coarsest level, at least
 
 
 @dataclass(frozen=True)
-class EnvmapConfig(LatLongConfig):
+class EnvmapConfig:
     """An environment map of texels, with traced visibility."""
 
     kind: Literal["envmap"] = field(default="envmap", init=False, metadata=KIND)
@@ -91,7 +91,7 @@ LOBE_GAIN = (
 
 
 @dataclass(frozen=True)
-class EnvmapSGConfig(LatLongConfig):
+class EnvmapSGConfig:
     """An environment map of spherical Gaussians, with traced visibility."""
 
     kind: Literal["envmap-sg"] = field(default="envmap-sg", init=False, metadata=KIND)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from dataclasses import replace
 
 import torch
@@ -16,13 +16,6 @@ from univoxel.lights.base import AbstractLight
 from univoxel.sphere import latlong_directions, texel_solid_angles
 
 
-class LatLongConfig(ABC):
-    """What the configurations of both lights have."""
-
-    directions: int  # of the half-sphere, in training, >= 1
-    directions_eval: int  # in evaluation, >= 1
-
-
 class AbstractLatLongLight(AbstractLight):
     """Light from far away, the same for all points: a lat-long map, interpolated bilinearly.
 
@@ -31,17 +24,12 @@ class AbstractLatLongLight(AbstractLight):
     """
 
     traced = True
-    config: LatLongConfig
 
     @property
     @abstractmethod
     def radiance(self) -> Tensor:
         """The map [H, 2 H, 3] that is interpolated, linear, in the axes of
         docs/reference/conventions.md."""
-
-    @property
-    def directions(self) -> int:
-        return self.config.directions if self.training else self.config.directions_eval
 
     def incident(self, surface: Surface, wi: Tensor) -> Tensor:
         """Radiance [N, D, 3] from unit directions wi [N, D, 3], the same for all points."""

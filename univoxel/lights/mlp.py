@@ -50,17 +50,13 @@ class LocalMLP(BasisLight):
         config: MLPLightConfig | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
-        """
-        Args:
-            features: C of Surface.features, >= 0.
-            generator: draws the first weights.
-        """
+        """Arguments as of `AbstractLocalLight`."""
         config = config or MLPLightConfig()
-        super().__init__(features, config, config.rank + 1, generator)
+        start = torch.zeros(config.rank + 1, 3)
+        start[0] = START
+        super().__init__(features, config, start, generator)
         sizes = [3 + 6 * config.frequencies, *[config.hidden] * config.layers, config.rank]
         self.basis_net: MLP = MLP(sizes, generator or torch.default_generator)
-        with torch.no_grad():
-            self.base[0] = START
 
     def basis(self, wi: Tensor) -> Tensor:
         """[..., rank + 1] of unit directions [..., 3]; the first is 1."""

@@ -11,13 +11,7 @@ from torch import Tensor, nn
 from univoxel import brdf, ops, sphere
 from univoxel.core.records import Occlusion, Surface
 from univoxel.lights import base
-from univoxel.lights.base import (
-    AbstractLight,
-    AbstractLocalLight,
-    LocalLightConfig,
-    Regularisation,
-)
-from univoxel.ops.networks import MLP
+from univoxel.lights.base import AbstractLight, AbstractLocalLight, Regularisation
 
 
 def rotations(
@@ -155,27 +149,8 @@ class BasisLight(AbstractLocalLight):
     All points share the directions, so the basis is evaluated once a direction, and a matrix
     product does the rest. A bare sum swings below zero beside every lamp. Clamped there, it would
     get no gradient and stay dark; softplus is positive, follows the sum where light is bright, and
-    lets a dark direction come back.
+    lets a dark direction come back. `base` is [B, 3].
     """
-
-    def __init__(
-        self,
-        features: int,
-        config: LocalLightConfig,
-        count: int,
-        generator: torch.Generator | None,
-    ) -> None:
-        """
-        Args:
-            features: C of Surface.features, >= 0.
-            count: of the basis, B.
-            generator: draws the first weights.
-        """
-        super().__init__()
-        self.config = config
-        outputs = 3 * count
-        self.head: MLP = base.build_head(features, config.hidden, config.layers, outputs, generator)
-        self.base: nn.Parameter = nn.Parameter(torch.zeros(count, 3))
 
     @abstractmethod
     def basis(self, wi: Tensor) -> Tensor:
@@ -183,8 +158,7 @@ class BasisLight(AbstractLocalLight):
 
     def coefficients(self, surface: Surface) -> Tensor:
         """[N, B, 3] at each point."""
-        raw = self.head(base.encode(surface, self.config.scale))
-        return self.base + raw.unflatten(-1, (-1, 3))
+        return self.base + self.raw(surface).unflatten(-1, (-1, 3))
 
     def incident(self, surface: Surface, wi: Tensor) -> Tensor:
         """Radiance [N, D, 3] from unit directions wi [N, D, 3]; or [D, 3], the same for all."""

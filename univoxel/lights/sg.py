@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from univoxel import brdf, ops, sphere
 from univoxel.core.records import Occlusion, Surface
@@ -20,11 +20,8 @@ from univoxel.lights.base import (
     AbstractLocalLight,
     LocalLightConfig,
     Regularisation,
-    build_head,
-    encode,
 )
 from univoxel.ops import decode_lobes
-from univoxel.ops.networks import MLP
 
 _MIN_SHARPNESS = 0.1
 
@@ -94,23 +91,10 @@ class LocalSG(AbstractLocalLight):
         config: SGConfig | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
-        """
-        Args:
-            features: C of Surface.features, >= 0.
-            generator: draws the head's first weights.
-        """
-        super().__init__()
-        self.config = config = config or SGConfig()
-        self.head: MLP = build_head(
-            features, config.hidden, config.layers, 7 * config.lobes, generator
-        )
-        self.base: nn.Parameter = nn.Parameter(
-            white_light(config.lobes, config.max_sharpness)
-        )  # [K, 7]
-
-    def raw(self, surface: Surface) -> Tensor:
-        """What the head adds to the global light at each point: [N, 7 K]."""
-        return self.head(encode(surface, self.config.scale))
+        """Arguments as of `AbstractLocalLight`."""
+        config = config or SGConfig()
+        start = white_light(config.lobes, config.max_sharpness)  # [K, 7]
+        super().__init__(features, config, start, generator)
 
     def lobes_from_raw(self, raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Unit axis [N, K, 3], sharpness [N, K] and amplitude [N, K, 3] >= 0 of deviations."""

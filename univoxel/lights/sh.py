@@ -47,15 +47,11 @@ class LocalSH(BasisLight):
         config: SHConfig | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
-        """
-        Args:
-            features: C of Surface.features, >= 0.
-            generator: draws the head's first weights.
-        """
+        """Arguments as of `AbstractLocalLight`."""
         config = config or SHConfig()
-        super().__init__(features, config, (config.order + 1) ** 2, generator)
-        with torch.no_grad():
-            self.base[0] = START * math.sqrt(4 * math.pi)  # Y_00 is 1 / sqrt(4 pi)
+        start = torch.zeros((config.order + 1) ** 2, 3)
+        start[0] = START * math.sqrt(4 * math.pi)  # Y_00 is 1 / sqrt(4 pi)
+        super().__init__(features, config, start, generator)
 
     def basis(self, wi: Tensor) -> Tensor:
         """[..., (order + 1)^2] harmonics of unit directions [..., 3]."""

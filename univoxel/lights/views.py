@@ -55,29 +55,22 @@ class ViewLights(nn.Module):
     """
 
     def __init__(
-        self,
-        names: tuple[str, ...],
-        codes: int = 0,
-        directions: Tensor | None = None,
-        generator: torch.Generator | None = None,
+        self, names: tuple[str, ...], codes: int = 0, directions: Tensor | None = None
     ) -> None:
         """
         Args:
             names: of the V views, in the order of their numbers.
             codes: Z, >= 0; 0: the views differ by gains only.
             directions: [D, 3] unit, of the scene's map, where it may differ from view to view.
-            generator: draws the first codes.
         """
         super().__init__()
         self.names = names
         self.chosen: int | None = None  # whose light is shown where no view is named; None: mean
         self.shown: ShownLight | None = None  # in place of the mean
         self.gain_steps: nn.Parameter = nn.Parameter(torch.zeros(len(names), 3))
-        self.raw_codes = None
+        self.raw_codes: nn.Parameter | None = None
         if codes:
-            self.raw_codes: nn.Parameter | None = nn.Parameter(
-                torch.randn(len(names), codes, generator=generator)
-            )
+            self.raw_codes = nn.Parameter(torch.randn(len(names), codes))
         self.sky_weights = self.sky_basis = None
         if directions is not None:
             basis = real_harmonics(DEGREE, directions)[:, 1:].T  # the first is constant: the gain
@@ -90,11 +83,8 @@ class ViewLights(nn.Module):
         return len(self.names)
 
     def choose(self, view: str | None) -> None:
-        """Show the light of a view, by name or number, where none is named; None: the mean light.
-
-        Raises:
-            UserError: no such view.
-        """
+        """Show the light of a view, by name or number, where none is named; None: the mean light. A
+        UserError if there is no such view."""
         self.chosen = None if view is None else view_number(self.names, view, "light_of")
 
     def add(self, to_gains: Tensor, to_weights: Tensor | None = None) -> Tensor:

@@ -111,8 +111,7 @@ def sampled(picture: Tensor, place: Tensor) -> Tensor:
     if not native.serves(place):
         return sampled_reference(picture, place)
     colors = torch.empty(len(place), 3)
-    stored, *arrays = (t.contiguous() for t in (picture, LINEAR, place))
-    native.require().sample_picture(*native.arrays(stored, *arrays, colors), native.threads())
+    native.call("sample_picture", *(t.contiguous() for t in (picture, LINEAR, place)), colors)
     return colors
 
 
@@ -179,10 +178,8 @@ def add_photograph_(
         add_photograph_reference_(total, weights, *texels)
         return
     texels = face, barycentric, corners, shown.view(torch.uint8), values, matrix, mask, LINEAR
-    native.require().add_photograph(
-        *native.arrays(*(t.contiguous() for t in (*texels, picture)), total, weights),
-        *(scale, CLIPPED, OF_CLIPPED, native.threads()),
-    )
+    tensors = [t.contiguous() for t in (*texels, picture)]
+    native.call("add_photograph", *tensors, total, weights, scale, CLIPPED, OF_CLIPPED)
 
 
 def add_photograph_reference_(total: Tensor, weights: Tensor, *texels: Any) -> None:

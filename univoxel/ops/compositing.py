@@ -3,7 +3,6 @@ samples and composites a field."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
 
@@ -14,7 +13,7 @@ from torch.nn.functional import logsigmoid
 from univoxel.core.records import Bricks, Samples
 from univoxel.ops import grid as grid_sampling
 from univoxel.ops import hash_grid, native
-from univoxel.ops.differentiable import check, check_bricks, differentiable
+from univoxel.ops.differentiable import check, check_numbers, differentiable
 from univoxel.ops.grid import (
     SparseGrad,
     check_place,
@@ -83,8 +82,7 @@ def composite(
     check(
         "composite", alpha=(alpha, "M"), value=(value, "M C"), offsets=(offsets, "N+1", torch.int64)
     )
-    if not 0.0 <= early_stop <= 1.0:
-        raise ValueError(f"composite: early_stop must be in [0, 1], got {early_stop}")
+    check_numbers("composite", "in [0, 1]", early_stop=early_stop)
     if native.serves(alpha):
         return _composite(
             alpha.contiguous(), value.contiguous(), offsets.contiguous(), float(early_stop)
@@ -108,10 +106,8 @@ def composite_reference(
     return out, weight
 
 
-@differentiable(to="alpha value")
-def _composite(
-    alpha: Tensor, value: Tensor, offsets: Tensor, early_stop: float
-) -> tuple[Tensor, Tensor]:
+@differentiable("alpha* value* offsets", "float early_stop", outputs=2)
+def _composite(alpha, value, offsets, early_stop):
     return value.new_empty(len(offsets) - 1, value.shape[1]), torch.empty_like(alpha)
 
 
@@ -188,12 +184,10 @@ def composite_field(
     treated as constant. Second order raises.
     Source: Wang et al. 2021 (NeuS), eq. 13; Max 1995 for the sums.
     """
-    nodes = "X Y Z"
-    if bricks is not None:
-        check_bricks("composite_field", bricks, sdf=(sdf, "R"))
-        nodes = "R"
+    nodes = "X Y Z" if bricks is None else "R"
     sizes = check(
         "composite_field",
+        bricks,
         sdf=(sdf, nodes),
         features=(features, "T F" if levels is not None else f"{nodes} C"),
         origin=(origin, "N 3"),
@@ -207,10 +201,8 @@ def composite_field(
     if levels is not None:
         check_levels("composite_field", sizes["T"], *levels)
     check_place("composite_field", len(samples.t), grid_origin, voxel_size)
-    if not 0 < inv_s < math.inf:
-        raise ValueError(f"composite_field: inv_s must be positive and finite, got {inv_s}")
-    if not 0 <= min_share < 1:
-        raise ValueError(f"composite_field: min_share must be in [0, 1), got {min_share}")
+    check_numbers("composite_field", "above 0", inv_s=inv_s)
+    check_numbers("composite_field", "in [0, 1)", min_share=min_share)
     start = [float(x) for x in grid_origin]
     if native.serves(sdf):
         table = grid_sampling.no_table(sdf) if bricks is None else bricks.table
@@ -282,16 +274,10 @@ def composite_field_reference(
 def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) -> None:
     sdf, features, table, *rays = tensors
     *place, lower, upper, voxel_sizes, inv_s, min_share, _ = options
-    native.require().composite_field_forward(
-        grid_sampling.grid_of(table, *place),
-        *native.arrays(sdf, features),
-        *hash_grid.place_of(lower, upper, voxel_sizes),
-        *native.arrays(*rays),
-        inv_s,
-        min_share,
-        *native.arrays(*outputs),
-        native.threads(),
-    )
+    grid = grid_sampling.grid_of(table, *place)
+    levels = hash_grid.place_of(lower, upper, voxel_sizes)
+    read = sdf, features, *levels, *rays, inv_s, min_share
+    native.call("composite_field_forward", grid, *read, *outputs)
 
 
 def _backward(
@@ -301,26 +287,19 @@ def _backward(
     sdf, features, table, *rays, held = saved
     _, direction, t, _, offsets = rays
     *place, lower, upper, voxel_sizes, inv_s, min_share, sparse = options
-    core, grid = native.require(), grid_sampling.grid_of(table, *place)
+    grid = grid_sampling.grid_of(table, *place)
     levels = hash_grid.place_of(lower, upper, voxel_sizes)
     # Where samples lie, NaN where no features were read; and derivatives to what was read of them
     points, feature_points, of_gradient = (t.new_empty(len(t), 3) for _ in range(3))
     of_value, of_feature = torch.empty_like(t), t.new_empty(len(t), held.shape[1] - SAMPLE_NUMBERS)
-    core.composite_field_pulls(
-        grid,
-        *native.arrays(sdf, features),
-        *levels,
-        *native.arrays(*rays),
-        *(inv_s, min_share),
-        *native.arrays(held, grads[0], points, feature_points),
-        *native.arrays(of_value, of_gradient, of_feature),
-        native.threads(),
-    )
+    read = sdf, features, *levels, *rays, inv_s, min_share
+    filled = points, feature_points, of_value, of_gradient, of_feature
+    native.call("composite_field_pulls", grid, *read, held, grads[0], *filled)
     hashed, moved = bool(voxel_sizes), needs[2] or needs[3]
     of_nodes = sdf.new_empty(*sdf.shape, 0) if hashed else features
     node_feature = of_feature[:, :0] if hashed else of_feature
     order = torch.empty(len(t), dtype=torch.int32)
-    core.sort_by_tile(grid, *native.arrays(points, order), native.threads())
+    native.call("sort_by_tile", grid, points, order)
     of_sdf, of_features, of_points = grid_sampling.gradients(
         grid,
         (sdf, of_nodes, points, order),
@@ -343,27 +322,18 @@ def _backward(
     return [of_sdf, of_features, of_origin, of_direction]
 
 
-@differentiable(to="sdf features origin direction", forward=_forward, backward=_backward, held=1)
-def _composite_field(
-    sdf: Tensor,
-    features: Tensor,
-    table: Tensor,
-    origin: Tensor,
-    direction: Tensor,
-    t: Tensor,
-    connected: Tensor,
-    offsets: Tensor,
-    size: list[int],
-    grid_origin: list[float],
-    voxel_size: float,
-    lower: list[float],
-    upper: list[float],
-    voxel_sizes: list[float],
-    inv_s: float,
-    min_share: float,
-    sparse_grad: bool,
-) -> tuple[Tensor, Tensor]:
+@differentiable(
+    "sdf* features* table origin* direction* t connected offsets",
+    "int[] size, float[] grid_origin, float voxel_size, float[] lower, float[] upper, "
+    "float[] voxel_sizes, float inv_s, float min_share, bool sparse_grad",
+    outputs=2,
+    forward=_forward,
+    backward=_backward,
+    held=1,
+)
+def _composite_field(sdf, features, table, origin, direction, t, connected, offsets, *options):
     """What rays sum up to, and what is held of samples for the way back."""
+    *_, voxel_sizes, _, _, _ = options
     channels = features.shape[-1] * max(len(voxel_sizes), 1)
     return (
         t.new_empty(len(offsets) - 1, RAY_NUMBERS + channels),

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from itertools import islice
-from typing import Any, List, TypeAlias, get_args  # noqa: UP035
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
@@ -15,7 +16,10 @@ from univoxel.ops import native
 
 
 def check(
-    op: str, **arguments: tuple[Tensor, str] | tuple[Tensor, str, torch.dtype]
+    op: str,
+    bricks: Bricks | None = None,
+    /,
+    **arguments: tuple[Tensor, str] | tuple[Tensor, str, torch.dtype],
 ) -> dict[str, int]:
     """Check the tensors of an op and return the size behind each letter.
 
@@ -24,13 +28,21 @@ def check(
     offset follows another ("N+1", bound by "N" elsewhere). Without a dtype the tensor is floating,
     of the same dtype as the other floating ones. All share one device.
 
+    Args:
+        bricks: of a sparse grid; "n" is the number of these bricks, and "R" that of their rows.
+
     Raises:
-        TypeError: an argument is not a tensor.
+        TypeError: an argument is not a tensor, or bricks are of another type.
         ValueError: a size, dtype or device is off; the message says what was wanted and what came.
     """
     sizes: dict[str, int] = {}
     floating: torch.dtype | None = None
     device: torch.device | None = None
+    if bricks is not None:
+        if not isinstance(bricks, Bricks):
+            raise TypeError(f"{op}: bricks must be of the type Bricks, got {type(bricks).__name__}")
+        n, device = len(bricks.place), bricks.table.device
+        sizes = {"n": n, "R": Bricks.NODES * n}
     for name, (tensor, wanted, *dtype) in arguments.items():
         if not isinstance(tensor, Tensor):
             raise TypeError(f"{op}: {name} must be a tensor, got {type(tensor).__name__}")
@@ -58,24 +70,24 @@ def check(
     return sizes
 
 
-def check_bricks(op: str, bricks: Bricks, **pools: tuple[Tensor, str]) -> None:
-    """Check that pools of values have a row for each node of the bricks, or one for each brick.
+RANGES: dict[str, Callable[[float], bool]] = {
+    "in [0, 1]": lambda x: 0 <= x <= 1,
+    "in [0, 1)": lambda x: 0 <= x < 1,
+    "at least 0": lambda x: 0 <= x < math.inf,
+    "at least 1": lambda x: 1 <= x < math.inf,
+    "above 0": lambda x: 0 < x < math.inf,
+}
 
-    Args:
-        pools: (tensor, sizes) as in `check`, the first size "R" for rows and "n" for bricks.
+
+def check_numbers(op: str, wanted: str, **numbers: float) -> None:
+    """Check the numbers of an op, which must be in a range, and finite.
 
     Raises:
-        TypeError, ValueError: as `check`; bricks is none, or of another size.
+        ValueError: one is not; the message says what was wanted and what came.
     """
-    if not isinstance(bricks, Bricks):
-        raise TypeError(f"{op}: bricks must be of the type Bricks, got {type(bricks).__name__}")
-    n = len(bricks.place)
-    wanted = {"R": Bricks.NODES * n, "n": n}
-    for name, (tensor, words) in pools.items():
-        letter, *rest = words.split()
-        check(op, **{name: (tensor, " ".join([str(wanted[letter]), *rest]))})
-        if tensor.device != bricks.table.device:
-            raise ValueError(f"{op}: bricks must be on {tensor.device}, got {bricks.table.device}")
+    for name, number in numbers.items():
+        if not RANGES[wanted](number):
+            raise ValueError(f"{op}: {name} must be {wanted}, got {number}")
 
 
 def _matches(word: str, size: int, sizes: dict[str, int]) -> bool:
@@ -92,9 +104,7 @@ def _matches(word: str, size: int, sizes: dict[str, int]) -> bool:
 # Ops with gradients: declared once, and registered with torch in full.
 
 
-LIST: Any = List[Tensor]  # noqa: UP006  torch 2.4 reads no other spelling
 Tensors: TypeAlias = Sequence[Any]  # or lists of tensors among them, as the op takes them
-Lengths: TypeAlias = "list[int | None]"  # of such lists; None stands for a single tensor
 # Called with tensors, options and outputs; fills the outputs
 Forward: TypeAlias = "Callable[[Tensors, Sequence, Sequence[Tensor]], None]"
 # Called with what was saved, gradients of the outputs that are not held, options, and whether each
@@ -104,19 +114,18 @@ Backward: TypeAlias = (
 )
 
 
-def differentiable(to: str, **settings: Any) -> Callable[[Callable], Differentiable]:
+def differentiable(
+    tensors: str, options: str = "", **settings: Any
+) -> Callable[[Callable], Differentiable]:
     """Make an op with gradients of a function that allocates its outputs.
 
-        @differentiable(to="alpha value")
-        def _composite(
-            alpha: Tensor, value: Tensor, offsets: Tensor, early_stop: float
-        ) -> tuple[Tensor, Tensor]:
+        @differentiable("alpha* value* offsets", "float early_stop", outputs=2)
+        def _composite(alpha, value, offsets, early_stop):
             return value.new_empty(len(offsets) - 1, value.shape[1]), torch.empty_like(alpha)
 
         out, weight = _composite(alpha, value, offsets, 0.0)
 
-    The op takes the arguments of the function: first contiguous tensors, then options, which are
-    numbers or lists of numbers. It calls these kernels of the extension:
+    The op calls these kernels of the extension:
 
         composite_forward(alpha, value, offsets, out, weight, early_stop, threads)
         composite_backward(alpha, value, offsets, grad_out, grad_weight,
@@ -127,18 +136,21 @@ def differentiable(to: str, **settings: Any) -> Callable[[Callable], Differentia
     so do derivatives in forward mode.
 
     Args:
-        to: names of the tensors that have gradients, in the order of the backward kernel.
-        name: of the op; that of the function when left out.
+        tensors: names of the arguments, which must be contiguous; with a star of those that have
+            gradients, in the order of the backward kernel. "[]" at the end: a list of tensors. If
+            there are lists, all arguments have gradients.
+        options: what follows, with types as in a schema of torch: numbers or lists of numbers.
+        outputs: how many.
         forward: calls the kernel, where it takes its arguments in another order.
         backward: likewise. If the op has an option `sparse_grad` and it is true, backward is called
             without an op: sizes of gradients may then depend on values.
         held: how many outputs, the last ones, serve the backward pass only. They have no gradient
             and are saved after the tensors.
-        optional: those of `to` whose gradient is an empty array where it is not needed. The kernel
-            computes the others always.
+        optional: those whose gradient is an empty array where it is not needed. The kernel computes
+            the others always.
         traced: backward is made of torch's operations and is no op. It takes what is held only.
     """
-    return lambda allocate: Differentiable(allocate, to.split(), **settings)
+    return lambda allocate: Differentiable(allocate, tensors.split(), options, **settings)
 
 
 class Differentiable(native.Operator):
@@ -147,48 +159,57 @@ class Differentiable(native.Operator):
     def __init__(
         self,
         allocate: Callable,
-        to: list[str],
-        name: str | None = None,
+        tensors: list[str],
+        options: str,
+        outputs: int = 1,
         forward: Forward | None = None,
         backward: Backward | None = None,
         held: int = 0,
         optional: str = "",
         traced: bool = False,
     ) -> None:
-        name = name or allocate.__name__.removeprefix("_")
-        hints = native.hints_of(allocate)
-        arguments = {n: h for n, h in hints.items() if n != "return"}
-        tensors = {n: h for n, h in arguments.items() if h in (Tensor, LIST)}
-        options = {n: h for n, h in arguments.items() if n not in tensors}
-        outputs = get_args(hints["return"]) or (Tensor,)
-        lists = LIST in tensors.values()
-        assert [*arguments] == [*tensors, *options], "tensors come before options"
-        assert not lists or to == [*tensors], "with list arguments, `to` must name every tensor"
-        self._to = [[*tensors].index(n) for n in to]
-        self._count, self._tensors = len(arguments), len(tensors)
-        self._held, self._shown = held, len(outputs) - held
-        self._sparse = [*options].index("sparse_grad") if "sparse_grad" in options else None
+        name = allocate.__name__.removeprefix("_")
+        names = [t.partition("*")[0] for t in tensors]
+        arguments = [
+            f"{'Tensor[]' if t.endswith('[]') else 'Tensor'} {n}"
+            for t, n in zip(tensors, names, strict=True)
+        ]
+        listed = options.split(", ") if options else []
+        n = len(tensors)
+        self._to = [i for i, t in enumerate(tensors) if "*" in t]
+        self._count, self._tensors = n + len(listed), n
+        self._lists = any(t.endswith("[]") for t in tensors)
+        assert not self._lists or len(self._to) == n, "with lists, all have gradients"
+        self._held, self._shown = held, outputs - held
+        sparse = "bool sparse_grad"
+        self._sparse = listed.index(sparse) if sparse in listed else None
         self._traced = traced
-        spared = [n in optional.split() for n in to]
+        spared = [names[i] in optional.split() for i in self._to]
         self._find = backward or _backward_by_name(name, self._to, spared)
-        fill = forward or _forward_by_name(name)
-        n, several = len(tensors), len(outputs) > 1
+        kernel = f"{name}_forward"
 
         def run(tensors: Tensors, options: Sequence) -> Any:
             out = allocate(*tensors, *options)
-            fill(tensors, options, out if several else (out,))
+            filled = out if outputs > 1 else (out,)
+            if forward is None:
+                native.call(kernel, *tensors, *filled, *options)
+            else:
+                forward(tensors, options, filled)
             return out
 
-        super().__init__(name, lambda *inputs: run(inputs[:n], inputs[n:]), hints, allocate)
+        returned = ", ".join(["Tensor"] * outputs)
+        schema = f"({', '.join([*arguments, *listed])}) -> ({returned})"
+        super().__init__(name, lambda *inputs: run(inputs[:n], inputs[n:]), schema, allocate)
         self._run = run
-        self._function = self._register_lists() if lists else self._register()
+        self._function = self._register()
         if not traced:
-            more = [f"held_{i}" for i in range(held)] + [f"grad_{i}" for i in range(self._shown)]
-            needs = {"needs": List[bool]}  # noqa: UP006
+            more = [f"Tensor held_{i}" for i in range(held)]
+            more += [f"Tensor grad_{i}" for i in range(self._shown)]
+            taken = ", ".join([*arguments, *more, *listed, "bool[] needs"])
             self.backward: native.Operator = native.Operator(
                 f"{name}_backward",
                 self._backward_kernel,
-                tensors | dict.fromkeys(more, Tensor) | options | needs | {"return": LIST},
+                f"({taken}) -> Tensor[]",
                 self._backward_fake,
             )
 
@@ -212,65 +233,51 @@ class Differentiable(native.Operator):
 
     def _register(self) -> Callable:
         """Tell torch of the gradients; returns the short way, an autograd function."""
-        run, n, count, to = self._run, self._tensors, self._count, self._to
-        gradients = self._gradients
-
-        def save(ctx: Any, inputs: Sequence, output: Any) -> None:
-            self._save(ctx, inputs[:n], inputs[n:], output)
-
-        # With a setup_context of its own torch would look up the kernel's signature in every call
-        def forward(ctx: Any, *inputs: Any) -> Any:
-            tensors, options = inputs[:n], inputs[n:]
-            output = run(tensors, options)
-            self._save(ctx, tensors, options, output)
-            return output
-
-        def backward(ctx: Any, *grads: Tensor | None) -> tuple:
-            result: list[Tensor | None] = [None] * count
-            if grads[0] is not None:
-                needs = ctx.needs_input_grad
-                wanted = [needs[i] for i in to]
-                found = gradients(ctx.saved_tensors, grads, ctx.options, wanted)
-                for i, need, gradient in zip(to, wanted, found, strict=True):
-                    if need:
-                        result[i] = gradient
-            return tuple(result)
-
-        self.defined.register_autograd(backward, setup_context=save)
-        return _autograd_function(self.name, forward, backward)
-
-    def _register_lists(self) -> Callable:
-        """The same where there are lists of tensors. Autograd functions see single ones only."""
-        run, n = self._run, self._tensors
+        run, n, lists = self._run, self._tensors, self._lists
         none = [None] * (self._count - n)
 
         def save(ctx: Any, inputs: Sequence, output: Any) -> None:
-            ctx.lengths = _lengths(inputs[:n])
-            self._save(ctx, _flat(inputs[:n]), inputs[n:], output)
+            tensors = _flat(inputs[:n]) if lists else inputs[:n]
+            ctx.lengths = [len(t) if isinstance(t, list) else None for t in inputs[:n] if lists]
+            self._save(ctx, tensors, inputs[n:], output)
+
+        def gradients(ctx: Any, grads: Sequence[Tensor | None], needs: Sequence[bool]) -> list:
+            """Of all tensors one by one."""
+            result: list[Tensor | None] = [None] * len(needs)
+            if grads[0] is not None:
+                to = range(len(needs)) if lists else self._to
+                wanted = [needs[i] for i in to]
+                saved = _grouped(ctx.saved_tensors, ctx.lengths)
+                found = self._gradients(saved, grads, ctx.options, wanted)
+                for i, need, gradient in zip(to, wanted, found, strict=True):
+                    if need:
+                        result[i] = gradient
+            return result
 
         def backward(ctx: Any, *grads: Tensor | None) -> tuple:
-            found = gradients(ctx, grads, _flat(ctx.needs_input_grad[:n]))
+            needs = ctx.needs_input_grad[:n]
+            found = gradients(ctx, grads, _flat(needs) if lists else needs)
             return *_grouped(found, ctx.lengths), *none
 
-        def gradients(ctx: Any, grads: Sequence[Tensor | None], needs: list[bool]) -> list:
-            saved = _grouped(ctx.saved_tensors, ctx.lengths)
-            found = self._gradients(saved, grads, ctx.options, needs)
-            return [g if need else None for g, need in zip(found, needs, strict=True)]
-
-        # What comes one by one is what autograd sees; the kernel reads the same, as the op takes it
-        def forward_of_single(ctx: Any, inputs: Sequence, *flat: Tensor) -> Any:
-            tensors, options = inputs[:n], inputs[n:]
-            output = run(tensors, options)
-            ctx.lengths = _lengths(tensors)
-            self._save(ctx, flat, options, output)
+        # The short way. Autograd sees single tensors only; the kernel reads the same, as the op
+        # takes it. With a setup_context torch would look up forward's signature in every call
+        def forward(ctx: Any, inputs: Sequence, *_: Tensor) -> Any:
+            output = run(inputs[:n], inputs[n:])
+            save(ctx, inputs, output)
             return output
 
-        def backward_of_single(ctx: Any, *grads: Tensor | None) -> tuple:
+        def short_backward(ctx: Any, *grads: Tensor | None) -> tuple:
             return None, *gradients(ctx, grads, ctx.needs_input_grad[1:])
 
         self.defined.register_autograd(backward, setup_context=save)
-        apply = _autograd_function(self.name, forward_of_single, backward_of_single)
-        return lambda *inputs: apply(inputs, *_flat(inputs[:n]))
+        methods = {"forward": staticmethod(forward), "backward": staticmethod(short_backward)}
+        function = type(self.name, (torch.autograd.Function,), methods)
+        # Its own `apply` looks for functorch's transforms first, as `goes_by_library` has done
+        beyond: Any = super(torch.autograd.Function, function)
+        apply = beyond.apply
+        if lists:
+            return lambda *inputs: apply(inputs, *_flat(inputs[:n]))
+        return lambda *inputs: apply(inputs, *inputs[:n])
 
     def _save(self, ctx: Any, tensors: Sequence, options: Sequence, output: Any) -> None:
         ctx.options = options
@@ -344,16 +351,6 @@ class _Once(torch.autograd.Function):
         )
 
 
-def _forward_by_name(name: str) -> Forward:
-    name = f"{name}_forward"
-
-    def forward(tensors: Tensors, options: Sequence, outputs: Sequence[Tensor]) -> None:
-        kernel = getattr(native.require(), name)
-        kernel(*native.arrays(*tensors, *outputs), *options, native.threads())
-
-    return forward
-
-
 def _backward_by_name(name: str, to: list[int], optional: list[bool]) -> Backward:
     name = f"{name}_backward"
 
@@ -364,23 +361,10 @@ def _backward_by_name(name: str, to: list[int], optional: list[bool]) -> Backwar
             torch.empty_like(saved[i]) if need or not spared else saved[i].new_empty(0)
             for i, spared, need in zip(to, optional, needs, strict=True)
         ]
-        kernel = getattr(native.require(), name)
-        kernel(*native.arrays(*saved, *grads, *found), *options, native.threads())
+        native.call(name, *saved, *grads, *found, *options)
         return found
 
     return backward
-
-
-def _autograd_function(name: str, forward: Callable, backward: Callable) -> Callable:
-    methods = {"forward": staticmethod(forward), "backward": staticmethod(backward)}
-    function = type(name, (torch.autograd.Function,), methods)
-    # Its own `apply` looks for functorch's transforms first, as `goes_by_library` has done
-    beyond: Any = super(torch.autograd.Function, function)
-    return beyond.apply
-
-
-def _lengths(tensors: Tensors) -> Lengths:
-    return [len(t) if isinstance(t, list) else None for t in tensors]
 
 
 def _flat(values: Iterable) -> list:
@@ -394,8 +378,14 @@ def _flat(values: Iterable) -> list:
     return flat
 
 
-def _grouped(flat: Iterable, lengths: Lengths) -> list:
-    """What `_flat` was made of, and what follows it."""
+def _grouped(flat: Sequence, lengths: Sequence[int | None]) -> Sequence:
+    """What `_flat` was made of, and what follows it.
+
+    Args:
+        lengths: of the lists; None stands for a single tensor. Nothing: there are no lists.
+    """
+    if not lengths:
+        return flat
     rest = iter(flat)
     groups = [next(rest) if n is None else list(islice(rest, n)) for n in lengths]
     return [*groups, *rest]

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from univoxel.core.records import Bricks
 from univoxel.ops import native
-from univoxel.ops.differentiable import Differentiable, check, check_bricks, differentiable
+from univoxel.ops.differentiable import check, check_numbers, differentiable
 
 # What the sampling of dense and of sparse grids shares.
 #
@@ -30,8 +30,7 @@ def check_place(op: str, points: int, origin: Sequence[float], voxel_size: float
         raise ValueError(f"{op}: points must be fewer than 2^31, got {points}")
     if len(origin) != 3 or not all(math.isfinite(x) for x in origin):
         raise ValueError(f"{op}: origin must be 3 finite numbers, got {list(origin)}")
-    if not 0 < voxel_size < math.inf:
-        raise ValueError(f"{op}: voxel_size must be above 0, got {voxel_size}")
+    check_numbers(op, "above 0", voxel_size=voxel_size)
 
 
 class SparseGrad(torch.autograd.Function):
@@ -73,11 +72,9 @@ def gradients(
         sparse: those to sdf and features hold touched rows only.
     """
     sdf, features, points, order = inputs
-    core, threads = native.require(), native.threads()
     rows = None, None
     if sparse:
-        touching = native.arrays(points, order)
-        rows = core.touched_rows(grid, *touching, sdf.numel(), *needs[:2], threads)
+        rows = native.call("touched_rows", grid, points, order, sdf.numel(), *needs[:2])
     into = [
         None
         if not need
@@ -86,7 +83,7 @@ def gradients(
         else t.new_empty(len(r), *t.shape[sdf.dim() :])
         for t, r, need in zip((sdf, features, points), (*rows, None), needs, strict=True)
     ]
-    core.sample_grid_backward(grid, *native.arrays(*inputs, *grad_outputs, *into), *rows, threads)
+    native.call("sample_grid_backward", grid, *inputs, *grad_outputs, *into, *rows)
     return [
         g if g is None or r is None else _sparse_tensor(r, g, t.shape, sdf.dim())
         for g, r, t in zip(into, (*rows, None), (sdf, features, points), strict=True)
@@ -96,7 +93,7 @@ def gradients(
 def _sparse_tensor(rows: Any, values: Tensor, shape: torch.Size, dims: int) -> Tensor:
     """Values of touched rows as a tensor that is sparse in its first dimensions."""
     indices = torch.empty(dims, len(rows), dtype=torch.int64)
-    rows.write(indices.numpy(), native.threads())
+    native.call(rows.write, indices)
     # The rows are distinct, in order and inside by construction: checking costs more than they do.
     return torch.sparse_coo_tensor(
         indices, values, shape, is_coalesced=True, check_invariants=False
@@ -106,11 +103,8 @@ def _sparse_tensor(rows: Any, values: Tensor, shape: torch.Size, dims: int) -> T
 def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) -> None:
     sdf, features, table, points = tensors
     value, gradient, feature, order = outputs
-    native.require().sample_grid_forward(
-        grid_of(table, *options[:3]),
-        *native.arrays(sdf, features, points, order, value, gradient, feature),
-        native.threads(),
-    )
+    grid, filled = grid_of(table, *options[:3]), (order, value, gradient, feature)
+    native.call("sample_grid_forward", grid, sdf, features, points, *filled)
 
 
 def _backward(
@@ -121,16 +115,15 @@ def _backward(
     return gradients(grid_of(table, *place), (sdf, features, points, order), grads, needs, sparse)
 
 
-def _sampled(
-    sdf: Tensor,
-    features: Tensor,
-    table: Tensor,
-    points: Tensor,
-    size: list[int],
-    origin: list[float],
-    voxel_size: float,
-    sparse_grad: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+@differentiable(
+    "sdf* features* table points*",
+    "int[] size, float[] origin, float voxel_size, bool sparse_grad",
+    outputs=4,
+    forward=_forward,
+    backward=_backward,
+    held=1,
+)
+def _sample_grid(sdf, features, table, points, *_):
     """Value, gradient, feature, and the points' order by tile, which backward uses again."""
     m = len(points)
     return (
@@ -139,12 +132,6 @@ def _sampled(
         features.new_empty(m, features.shape[-1]),
         points.new_empty(m, dtype=torch.int32),
     )
-
-
-def sampler(name: str) -> Differentiable:
-    """The op of that name. It is the same for both: a dense grid is one without a table."""
-    to = "sdf features points"
-    return differentiable(to, name=name, forward=_forward, backward=_backward, held=1)(_sampled)
 
 
 # Sampling of a dense grid: distance, its spatial gradient and features at points.
@@ -206,7 +193,7 @@ def sample_dense(
     if native.serves(sdf):
         tensors = (t.contiguous() for t in (sdf, features, no_table(sdf), points))
         place = list(sdf.shape), [float(x) for x in origin], float(voxel_size)
-        return _sample_dense(*tensors, *place, sparse_grad)[:3]
+        return _sample_grid(*tensors, *place, sparse_grad)[:3]
     if sparse_grad:
         sdf, features = SparseGrad.apply(sdf, 3), SparseGrad.apply(features, 3)
     return sample_dense_reference(sdf, features, points, origin, voxel_size)
@@ -239,9 +226,6 @@ def sample_dense_reference(
         gradient = gradient + weight[:, None] * slope
     value = torch.where(lost[:, 0], torch.nan, value)
     return value, torch.where(lost, torch.nan, gradient), torch.where(lost, torch.nan, feature)
-
-
-_sample_dense = sampler("sample_dense")
 
 
 # Sampling of a grid of which only bricks around a surface are stored.
@@ -280,17 +264,17 @@ def sample_sparse(
     Differentiable in: sdf, features, points. Second order raises.
     Source: bricks over a table, as in Museth 2013 (VDB) with one level.
     """
-    check_bricks("sample_sparse", bricks, sdf=(sdf, "R"), features=(features, "R C"))
-    sizes = check(
-        "sample_sparse", sdf=(sdf, "R"), features=(features, "R C"), points=(points, "M 3")
-    )
+    if bricks is None:
+        raise TypeError("sample_sparse: bricks must be of the type Bricks, got NoneType")
+    tensors = {"sdf": (sdf, "R"), "features": (features, "R C"), "points": (points, "M 3")}
+    sizes = check("sample_sparse", bricks, **tensors)
     if not bricks.table.numel():
         raise ValueError(f"sample_sparse: bricks must not be empty, got size {list(bricks.size)}")
     check_place("sample_sparse", sizes["M"], origin, voxel_size)
     if native.serves(sdf):
         tensors = (t.contiguous() for t in (sdf, features, bricks.table, points))
         place = list(bricks.size), [float(x) for x in origin], float(voxel_size)
-        return _sample_sparse(*tensors, *place, sparse_grad)[:3]
+        return _sample_grid(*tensors, *place, sparse_grad)[:3]
     if sparse_grad:
         sdf, features = SparseGrad.apply(sdf, 1), SparseGrad.apply(features, 1)
     return sample_sparse_reference(sdf, features, bricks, points, origin, voxel_size)
@@ -310,6 +294,3 @@ def sample_sparse_reference(
     whole = torch.where(stored, sdf[rows], sdf.detach()[rows])
     of_nodes = torch.where(stored[..., None], features[rows], features.detach()[rows])
     return sample_dense_reference(whole, of_nodes, points, origin, voxel_size)
-
-
-_sample_sparse = sampler("sample_sparse")

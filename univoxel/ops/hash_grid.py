@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from univoxel.ops import native
-from univoxel.ops.differentiable import check, differentiable
+from univoxel.ops.differentiable import check, check_numbers, differentiable
 from univoxel.ops.grid import SparseGrad
 
 PRIMES = (1, 2654435761, 805459861)
@@ -67,8 +67,7 @@ def encode_hash(
     levels = len(voxel_sizes)
     place = ([float(x) for x in lower], [float(x) for x in upper], [float(h) for h in voxel_sizes])
     felt = levels if felt is None else min(felt, levels)
-    if felt < 0:
-        raise ValueError(f"encode_hash: felt must be at least 0, got {felt}")
+    check_numbers("encode_hash", "at least 0", felt=felt)
     if native.serves(table):
         return _encode_hash(table.contiguous(), points.contiguous(), *place, sparse_grad, felt)
     if sparse_grad:
@@ -193,9 +192,9 @@ def place_of(lower: list[float], upper: list[float], voxel_sizes: list[float]) -
 
 def _touched(table: Tensor, points: Tensor, place: Place) -> tuple[Any, Tensor]:
     """The rows that points read, as the extension has them, and as [K] int64, ascending."""
-    touched = native.require().hash_rows(*native.arrays(table, points), *place, native.threads())
+    touched = native.call("hash_rows", table, points, *place)
     rows = torch.empty(len(touched), dtype=torch.int64)
-    touched.write(rows.numpy(), native.threads())
+    native.call(touched.write, rows)
     return touched, rows
 
 
@@ -221,14 +220,8 @@ def gradients(
     elif needs[0]:
         of_table = torch.empty_like(table)
     of_points = torch.empty_like(points) if needs[1] else None
-    native.require().encode_hash_backward(
-        *native.arrays(table, points, grad_out, of_table),
-        touched,
-        *native.arrays(of_points),
-        *place,
-        felt,
-        native.threads(),
-    )
+    filled = of_table, touched, of_points
+    native.call("encode_hash_backward", table, points, grad_out, *filled, *place, felt)
     if rows is not None and of_table is not None:
         # They are distinct, in order and inside by construction: checking costs more than they do
         of_table = torch.sparse_coo_tensor(
@@ -238,9 +231,7 @@ def gradients(
 
 
 def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) -> None:
-    native.require().encode_hash_forward(
-        *native.arrays(*tensors, *outputs), *place_of(*options[:3]), native.threads()
-    )
+    native.call("encode_hash_forward", *tensors, *outputs, *place_of(*options[:3]))
 
 
 def _backward(
@@ -251,14 +242,11 @@ def _backward(
     return gradients(table, points, grads[0], place, felt, needs, sparse)
 
 
-@differentiable(to="table points", forward=_forward, backward=_backward)
-def _encode_hash(
-    table: Tensor,
-    points: Tensor,
-    lower: list[float],
-    upper: list[float],
-    voxel_sizes: list[float],
-    sparse_grad: bool,
-    felt: int,
-) -> Tensor:
+@differentiable(
+    "table* points*",
+    "float[] lower, float[] upper, float[] voxel_sizes, bool sparse_grad, int felt",
+    forward=_forward,
+    backward=_backward,
+)
+def _encode_hash(table, points, lower, upper, voxel_sizes, *_):
     return points.new_empty(len(points), len(voxel_sizes) * table.shape[1])

@@ -177,18 +177,15 @@ def relight(
         raise RuntimeError("relight: runs on the native backend only, got use_backend('reference')")
     points = (position, normal, wo, albedo, roughness, _rows_of_f0(f0, position))
     rgb = torch.empty_like(position, memory_format=torch.contiguous_format)
-    core = native.require()
-    core.relight(
+    native.call(
+        "relight",
         traced,
-        *map(_array, materials),
-        *map(_array, (tables.texel, tables.row_cdf, tables.column_cdf)),
+        *map(_contiguous, (*materials, tables.texel, tables.row_cdf, tables.column_cdf)),
         tables.rotation,
-        *map(_array, (_pack_suns(suns), _pack_point_lights(point_lights))),
-        *map(_array, points),
-        *native.arrays(rgb),
+        *map(_contiguous, (_pack_suns(suns), _pack_point_lights(point_lights), *points)),
+        rgb,
         *(offset, first, samples, bounces, seed),
-        getattr(core.Strategy, strategy),
-        native.threads(),
+        getattr(native.require().Strategy, strategy),
     )
     return rgb
 
@@ -213,8 +210,8 @@ def _rows_of_f0(f0: Tensor | float, like: Tensor) -> Tensor:
     return stored_f0("relight", f0, like).expand_as(like)
 
 
-def _array(tensor: Tensor | None):
-    return None if tensor is None else native.arrays(tensor.contiguous())[0]
+def _contiguous(tensor: Tensor | None) -> Tensor | None:
+    return None if tensor is None else tensor.contiguous()
 
 
 def _pack_suns(suns: Sequence[Sun]) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from univoxel.core.records import Bricks, Samples
 from univoxel.ops import native
-from univoxel.ops.differentiable import check, check_bricks
+from univoxel.ops.differentiable import check, check_numbers
 
 BRICK = 4  # voxels along the side of a brick that is skipped as a whole; as kBrick in csrc/nodes.h
 
@@ -33,7 +33,7 @@ def brick_minimum(sdf: Tensor, bricks: Bricks | None = None) -> Tensor:
     check("brick_minimum", sdf=(sdf, "X Y Z"))
     if native.serves(sdf):
         out = sdf.new_empty([max(1, (n - 2) // BRICK + 1) for n in sdf.shape])
-        native.require().brick_minimum(*native.arrays(sdf.contiguous(), out), native.threads())
+        native.call("brick_minimum", sdf.contiguous(), out)
         return out
     for axis in range(3):
         n = sdf.shape[axis]
@@ -48,16 +48,12 @@ def brick_minimum(sdf: Tensor, bricks: Bricks | None = None) -> Tensor:
 
 
 def _sparse_brick_minimum(sdf: Tensor, bricks: Bricks) -> Tensor:
-    check_bricks("brick_minimum", bricks, sdf=(sdf, "R"))
+    check("brick_minimum", bricks, sdf=(sdf, "R"))
     n = len(bricks.place)
     if native.serves(sdf):
         out = sdf.new_empty(n)
-        native.require().sparse_brick_minimum(
-            *native.arrays(sdf.contiguous(), bricks.table, bricks.place),
-            bricks.size,
-            out.numpy(),
-            native.threads(),
-        )
+        where = bricks.table, bricks.place, bricks.size
+        native.call("sparse_brick_minimum", sdf.contiguous(), *where, out)
         return out
     out = sdf.new_full((n,), torch.inf)
     out[1] = -torch.inf
@@ -113,22 +109,17 @@ def march(
 
     Not differentiable. Source: Wang et al. 2021 (NeuS), eq. 13.
     """
-    if bricks is not None:
-        check_bricks("march", bricks, sdf=(sdf, "R"), brick_min=(brick_min, "n"))
     check(
         "march",
+        bricks,
         sdf=(sdf, "X Y Z" if bricks is None else "R"),
         brick_min=(brick_min, "A B C" if bricks is None else "n"),
         origin=(origin, "N 3"),
         direction=(direction, "N 3"),
         jitter=(jitter, "N"),
     )
-    for name, number in (("voxel_size", voxel_size), ("step", step), ("inv_s", inv_s)):
-        if not 0 < number < float("inf"):
-            raise ValueError(f"march: {name} must be positive and finite, got {number}")
-    for name, number in (("min_weight", min_weight), ("early_stop", early_stop)):
-        if not 0 <= number <= 1:
-            raise ValueError(f"march: {name} must be in [0, 1], got {number}")
+    check_numbers("march", "above 0", voxel_size=voxel_size, step=step, inv_s=inv_s)
+    check_numbers("march", "in [0, 1]", min_weight=min_weight, early_stop=early_stop)
     if not native.serves(sdf):
         return march_reference(
             sdf if bricks is None else sdf[bricks.grid_rows()],
@@ -143,17 +134,13 @@ def march(
             early_stop=early_stop,
         )
     tensors = [t.contiguous() for t in (sdf, brick_min, origin, direction, jitter)]
-    t, connected, offsets = native.require().march(
-        *native.arrays(*tensors),
+    t, connected, offsets = native.call(
+        "march",
+        *tensors,
         tuple(map(float, grid_origin)),
-        float(voxel_size),
-        float(step),
-        float(inv_s),
-        float(min_weight),
-        float(early_stop),
-        None if bricks is None else bricks.table.numpy(),
+        *map(float, (voxel_size, step, inv_s, min_weight, early_stop)),
+        None if bricks is None else bricks.table,
         sdf.shape if bricks is None else bricks.size,
-        native.threads(),
     )
     return Samples(
         torch.from_numpy(t), torch.from_numpy(connected).bool(), torch.from_numpy(offsets)

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import inspect
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any, List, Literal, get_args, get_origin, get_type_hints  # noqa: UP035
+from typing import Any, Literal
 
 import torch  # first: the extension then shares torch's OpenMP runtime
 from torch import Tensor
@@ -185,18 +184,26 @@ def require_embree(what: str) -> ModuleType:
     return found
 
 
-def arrays(*tensors: Tensor | None) -> list[Any]:
-    """NumPy views of tensors, as the extension takes them: halves as their bits, None as it is."""
+def call(kernel: str | Callable, *arguments: Any) -> Any:
+    """Call a kernel, by name or as it is: with tensors as `arrays`, and the number of threads as
+    last argument."""
+    kernel = getattr(require(), kernel) if isinstance(kernel, str) else kernel
+    return kernel(*arrays(*arguments), threads())
+
+
+def arrays(*arguments: Any) -> list[Any]:
+    """NumPy views of tensors, as the extension takes them: halves as their bits. What is no tensor
+    stays as it is."""
     # Every call of an op pays for each of these steps
     return [
         t
-        if t is None
+        if not isinstance(t, Tensor)
         else t.view(torch.uint16).numpy()
         if t.dtype is torch.float16
         else t.detach().numpy()
         if t.requires_grad
         else t.numpy()
-        for t in tensors
+        for t in arguments
     ]
 
 
@@ -228,20 +235,20 @@ class Operator:
         self,
         name: str,
         kernel: Callable,
-        hints: dict[str, Any],
+        schema: str,
         fake: Callable,
         mutates_args: tuple[str, ...] = (),
     ) -> None:
         """
         Args:
-            hints: types of the arguments and of what is returned, as in `hints_of`.
+            schema: arguments and what is returned, as torch spells them.
             fake: called as the kernel is; returns what comes out, without values.
         """
         qualified = f"univoxel::{name}"
         self.name: str = name
         self.kernel: Callable[..., Any] = kernel
         self.defined: Any = torch.library.custom_op(
-            qualified, _with_hints(kernel, hints), mutates_args=mutates_args, device_types=()
+            qualified, kernel, mutates_args=mutates_args, device_types=(), schema=schema
         )
         # Kernels that custom_op registers itself import the compiler when first called: a second,
         # and 70 MB, of every command
@@ -263,34 +270,3 @@ def goes_by_library(arguments: Sequence[Any]) -> bool:
         or torch._C._are_functorch_transforms_active()
         or not PLAIN.issuperset(map(type, arguments))
     )
-
-
-def in_place(name: str, mutates_args: tuple[str, ...]) -> Callable[[Callable], Operator]:
-    """Make an `Operator` of a kernel for the CPU that changes arguments and returns nothing."""
-    return lambda kernel: Operator(name, kernel, hints_of(kernel), lambda *_: None, mutates_args)
-
-
-def hints_of(function: Callable) -> dict[str, Any]:
-    """Types of arguments by name, and of "return", as every torch since 2.4 reads them: that reads
-    neither text, which `from __future__` makes of them, nor list[float]."""
-    return {name: _spelt_out(hint) for name, hint in get_type_hints(function).items()}
-
-
-def _spelt_out(hint: Any) -> Any:
-    if hint is type(None):
-        return None
-    return List[get_args(hint)] if get_origin(hint) is list else hint  # noqa: UP006
-
-
-def _with_hints(kernel: Callable, hints: dict[str, Any]) -> Callable:
-    """A kernel of any arguments with those that torch makes the schema of."""
-
-    def named(*arguments: Any) -> Any:
-        return kernel(*arguments)
-
-    kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
-    named.__signature__ = inspect.Signature(  # pyright: ignore[reportFunctionMemberAccess]
-        [inspect.Parameter(n, kind, annotation=h) for n, h in hints.items() if n != "return"],
-        return_annotation=hints["return"],
-    )
-    return named

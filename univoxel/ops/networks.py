@@ -62,9 +62,8 @@ def mlp_reference(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]
 
 def _forward(tensors: Sequence, _: Sequence, outputs: Sequence[Tensor]) -> None:
     x, weights, biases = tensors
-    n = len(weights)
-    x, *layers, out = native.arrays(x, *weights, *biases, *outputs)
-    native.require().mlp_forward(x, layers[:n], layers[n:], out, native.threads())
+    layers = native.arrays(*weights), native.arrays(*biases)
+    native.call("mlp_forward", x, *layers, *outputs)
 
 
 def _backward(
@@ -75,16 +74,13 @@ def _backward(
     n, need_x, need_layers = len(weights), needs[0], any(needs[1:])
     of_x = torch.empty_like(x) if need_x else None
     of_layers = [torch.empty_like(t) for t in (*weights, *biases)] if need_layers else []
-    x, *layers, grad_out = native.arrays(x, *weights, *biases, *grads)
-    into_x, *into = native.arrays(of_x, *of_layers)
-    native.require().mlp_backward(
-        x, layers[:n], layers[n:], grad_out, into_x, into[:n], into[n:], native.threads()
-    )
+    layers, into = (native.arrays(*weights), native.arrays(*biases)), native.arrays(*of_layers)
+    native.call("mlp_backward", x, *layers, *grads, of_x, into[:n], into[n:])
     return [of_x, *(of_layers or [None] * (2 * n))]
 
 
-@differentiable(to="x weights biases", forward=_forward, backward=_backward)
-def _mlp(x: Tensor, weights: list[Tensor], biases: list[Tensor]) -> Tensor:
+@differentiable("x* weights*[] biases*[]", forward=_forward, backward=_backward)
+def _mlp(x, weights, biases):
     return x.new_empty(len(x), len(biases[-1]))
 
 

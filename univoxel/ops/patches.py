@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from univoxel.ops import native
-from univoxel.ops.differentiable import check, differentiable
+from univoxel.ops.differentiable import check, check_numbers, differentiable
 
 NEAREST = 1e-6  # along the axis of a view: what lies before it is not seen
 
@@ -79,8 +79,7 @@ def patch_correlation(
             f"patch_correlation: brightness must have at least 2 rows and columns, "
             f"got {list(brightness.shape)}"
         )
-    if not 0 < noise < math.inf:
-        raise ValueError(f"patch_correlation: noise must be above 0, got {noise}")
+    check_numbers("patch_correlation", "above 0", noise=noise)
     tensors = (brightness, projection, origin, direction, own, views, position, normal)
     if not native.serves(position):
         return patch_correlation_reference(*tensors, noise)
@@ -140,11 +139,8 @@ def _looked_up(brightness: Tensor, views: Tensor, x: Tensor, y: Tensor) -> tuple
 
 def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) -> None:
     correlation, seen, slopes = outputs
-    native.require().patch_correlation(
-        *native.arrays(*tensors, correlation, seen.view(torch.uint8), slopes),
-        *options,
-        native.threads(),
-    )
+    filled = correlation, seen.view(torch.uint8), slopes
+    native.call("patch_correlation", *tensors, *filled, *options)
 
 
 def _backward(
@@ -153,18 +149,16 @@ def _backward(
     return (grads[0][..., None] * saved[0]).sum(1).split(3, 1)
 
 
-@differentiable(to="position normal", forward=_forward, backward=_backward, held=1, traced=True)
-def _patch_correlation(
-    brightness: Tensor,
-    projection: Tensor,
-    origin: Tensor,
-    direction: Tensor,
-    own: Tensor,
-    views: Tensor,
-    position: Tensor,
-    normal: Tensor,
-    noise: float,
-) -> tuple[Tensor, Tensor, Tensor]:
+@differentiable(
+    "brightness projection origin direction own views position* normal*",
+    "float noise",
+    outputs=3,
+    forward=_forward,
+    backward=_backward,
+    held=1,
+    traced=True,
+)
+def _patch_correlation(brightness, projection, origin, direction, own, views, position, *_):
     """Correlation, whether all is seen, and the derivative to position and normal."""
     n, k = views.shape
     seen = torch.empty(n, k, dtype=torch.bool, device=position.device)
@@ -244,9 +238,7 @@ def match_cost(
     aligned = pictures.clone() if pictures.storage_offset() % 4 else pictures
     pixels = aligned.contiguous().view(torch.int32)[..., 0]  # four bytes are looked up at once
     tensors = [t.contiguous() for t in (pixels, matrix, *rays)]
-    native.require().match_cost(
-        *native.arrays(*tensors, cost), step, most, radius, best, native.threads()
-    )
+    native.call("match_cost", *tensors, cost, step, most, radius, best)
     return cost
 
 
@@ -323,8 +315,7 @@ def semi_global(cost: Tensor, rows: Tensor, small: float, large: float) -> Tenso
         return semi_global_reference(cost, rows, small, large)
     cost, rows = cost.contiguous(), rows.contiguous()
     total = torch.empty_like(cost)
-    options = small, large, native.threads()
-    native.require().semi_global(*native.arrays(cost, rows, total), *options)
+    native.call("semi_global", cost, rows, total, small, large)
     return total
 
 

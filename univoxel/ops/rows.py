@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from univoxel.ops import native
-from univoxel.ops.differentiable import check
+from univoxel.ops.differentiable import check, check_numbers
 
 
 def adam_rows_(
@@ -66,14 +66,9 @@ def adam_rows_(
             raise ValueError(
                 f"adam_rows_: {name} must be contiguous, got strides {tensor.stride()}"
             )
-    for name, number in (("lr", lr), ("eps", eps)):
-        if not number >= 0:
-            raise ValueError(f"adam_rows_: {name} must be at least 0, got {number}")
-    for name, number in (("beta1", beta1), ("beta2", beta2)):
-        if not 0 <= number < 1:
-            raise ValueError(f"adam_rows_: {name} must be in [0, 1), got {number}")
-    if step < 1:
-        raise ValueError(f"adam_rows_: step must be at least 1, got {step}")
+    check_numbers("adam_rows_", "at least 0", lr=lr, eps=eps)
+    check_numbers("adam_rows_", "in [0, 1)", beta1=beta1, beta2=beta2)
+    check_numbers("adam_rows_", "at least 1", step=step)
     numbers = (float(lr), float(beta1), float(beta2), float(eps), int(step))
     if native.serves(param):
         _adam_rows(param, exp_avg, exp_avg_sq, rows.contiguous(), grad.contiguous(), *numbers)
@@ -101,23 +96,14 @@ def adam_rows_reference_(
     param[rows] -= lr / (1 - beta1**step) * m / (root + eps)
 
 
-@native.in_place("adam_rows_", ("param", "exp_avg", "exp_avg_sq"))
-def _adam_rows(
-    param: Tensor,
-    exp_avg: Tensor,
-    exp_avg_sq: Tensor,
-    rows: Tensor,
-    grad: Tensor,
-    lr: float,
-    beta1: float,
-    beta2: float,
-    eps: float,
-    step: int,
-) -> None:
-    native.require().adam_rows(
-        *native.arrays(param, exp_avg, exp_avg_sq, rows, grad),
-        *(lr, beta1, beta2, eps, step, native.threads()),
-    )
+_adam_rows = native.Operator(
+    "adam_rows_",
+    lambda *inputs: native.call("adam_rows", *inputs),
+    "(Tensor(a!) param, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, Tensor rows, Tensor grad, "
+    "float lr, float beta1, float beta2, float eps, int step) -> ()",
+    lambda *_: None,
+    mutates_args=("param", "exp_avg", "exp_avg_sq"),
+)
 
 
 # Sums of gradients that each hold some rows of a table.
@@ -161,12 +147,11 @@ def sum_rows(
         raise ValueError(f"sum_rows: every size in shape must be at least 1, got {list(shape)}")
     if not native.serves(values[0]):
         return sum_rows_reference(rows, values, shape)
-    core, threads = native.require(), native.threads()
     lists = [native.arrays(*(t.contiguous() for t in several)) for several in (rows, values)]
-    union = core.union_rows(*lists, math.prod(shape), threads)
+    union = native.call("union_rows", *lists, math.prod(shape))
     indices = torch.empty(len(shape), len(union), dtype=torch.int64)
     total = values[0].new_empty(len(union), values[0].shape[1])
-    core.sum_rows(*lists, union, *native.arrays(total, indices), list(shape), threads)
+    native.call("sum_rows", *lists, union, total, indices, list(shape))
     return indices, total
 
 

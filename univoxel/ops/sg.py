@@ -10,7 +10,7 @@ from torch import Tensor
 
 from univoxel import brdf, sphere
 from univoxel.ops import native
-from univoxel.ops.differentiable import check, differentiable
+from univoxel.ops.differentiable import check, check_numbers, differentiable
 from univoxel.ops.shade import sizes_of_f0, stored_f0
 
 SHORTEST = 1e-12  # squared length of a vector, below which its axis is shorter than 1
@@ -44,10 +44,8 @@ def decode_lobes(
     Differentiable in: parameters. Second order raises.
     """
     check("decode_lobes", parameters=(parameters, "M 7"))
-    if not 0 <= min_sharpness < math.inf:
-        raise ValueError(f"decode_lobes: min_sharpness must be at least 0, got {min_sharpness}")
-    if not 0 < max_sharpness < math.inf:
-        raise ValueError(f"decode_lobes: max_sharpness must be above 0, got {max_sharpness}")
+    check_numbers("decode_lobes", "at least 0", min_sharpness=min_sharpness)
+    check_numbers("decode_lobes", "above 0", max_sharpness=max_sharpness)
     if native.serves(parameters):
         return _decode_lobes(parameters.contiguous(), float(min_sharpness), float(max_sharpness))
     return decode_lobes_reference(parameters, min_sharpness, max_sharpness)
@@ -65,23 +63,25 @@ def decode_lobes_reference(
 
 
 def _forward(tensors: Sequence, options: Sequence, outputs: Sequence[Tensor]) -> None:
-    parameters, *lobes = native.arrays(*tensors, *outputs)
-    native.require().decode_lobes_forward(parameters, *options, *lobes, native.threads())
+    native.call("decode_lobes_forward", *tensors, *options, *outputs)
 
 
 def _backward(
     saved: Sequence, grads: Sequence[Tensor], options: Sequence, _: list[bool]
 ) -> list[Tensor]:
     grad = torch.empty_like(saved[0])
-    parameters, *others = native.arrays(*saved, *grads, grad)
-    native.require().decode_lobes_backward(parameters, *options, *others, native.threads())
+    native.call("decode_lobes_backward", *saved, *options, *grads, grad)
     return [grad]
 
 
-@differentiable(to="parameters", forward=_forward, backward=_backward)
-def _decode_lobes(
-    parameters: Tensor, min_sharpness: float, max_sharpness: float
-) -> tuple[Tensor, Tensor, Tensor]:
+@differentiable(
+    "parameters*",
+    "float min_sharpness, float max_sharpness",
+    outputs=3,
+    forward=_forward,
+    backward=_backward,
+)
+def _decode_lobes(parameters, *_):
     m = len(parameters)
     return parameters.new_empty(m, 3), parameters.new_empty(m), parameters.new_empty(m, 3)
 
@@ -181,17 +181,8 @@ def shade_sg_reference(
     return (2 * math.pi / len(directions)) * (radiance * f * cosine).sum(1)
 
 
-@differentiable(to="axis sharpness amplitude normal wo albedo roughness f0")
-def _shade_sg(
-    axis: Tensor,
-    sharpness: Tensor,
-    amplitude: Tensor,
-    normal: Tensor,
-    wo: Tensor,
-    albedo: Tensor,
-    roughness: Tensor,
-    directions: Tensor,
-    rotation: Tensor,
-    f0: Tensor,
-) -> Tensor:
+@differentiable(
+    "axis* sharpness* amplitude* normal* wo* albedo* roughness* directions rotation f0*"
+)
+def _shade_sg(axis, sharpness, amplitude, normal, *_):
     return torch.empty_like(normal)

@@ -3,14 +3,12 @@ direction."""
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
 from univoxel import brdf
 from univoxel.ops import native
-from univoxel.ops.differentiable import check, differentiable
+from univoxel.ops.differentiable import check, check_numbers, differentiable
 
 
 def sizes_of_f0(f0: Tensor | float) -> dict[str, tuple[Tensor, str]]:
@@ -29,8 +27,7 @@ def stored_f0(op: str, f0: Tensor | float, like: Tensor) -> Tensor:
         return f0
     if not isinstance(f0, int | float):
         raise TypeError(f"{op}: f0 must be a number or a tensor, got {type(f0).__name__}")
-    if not 0.0 <= f0 <= 1.0:
-        raise ValueError(f"{op}: f0 must be in [0, 1], got {f0}")
+    check_numbers(op, "in [0, 1]", f0=f0)
     return like.new_full((), f0)
 
 
@@ -166,8 +163,7 @@ def _check_rest(op: str, directions: Tensor, solid_angle: float, **constants: Te
     """What sizes and dtypes do not show."""
     if len(directions) == 0:
         raise ValueError(f"{op}: directions must hold at least one direction, got none")
-    if not 0.0 < solid_angle < math.inf:
-        raise ValueError(f"{op}: solid_angle must be above 0 and finite, got {solid_angle}")
+    check_numbers(op, "above 0", solid_angle=solid_angle)
     for name, tensor in constants.items():
         if tensor.requires_grad and torch.is_grad_enabled():
             raise NotImplementedError(f"{op}: gradients for {name} are not supported: detach it")
@@ -215,34 +211,21 @@ def shade_map_reference(
     )
 
 
-@differentiable(to="radiance normal albedo roughness f0", optional="radiance normal")
-def _shade_radiance(
-    radiance: Tensor,
-    normal: Tensor,
-    wo: Tensor,
-    albedo: Tensor,
-    roughness: Tensor,
-    directions: Tensor,
-    f0: Tensor,
-    solid_angle: float,
-) -> Tensor:
+@differentiable(
+    "radiance* normal* wo albedo* roughness* directions f0*",
+    "float solid_angle",
+    optional="radiance normal",
+)
+def _shade_radiance(radiance, normal, *_):
     return torch.empty_like(normal)
 
 
-@differentiable(to="map normal albedo roughness f0", optional="map normal")
-def _shade_map(
-    map: Tensor,
-    visibility: Tensor,
-    indirect: Tensor,
-    index: Tensor,
-    normal: Tensor,
-    wo: Tensor,
-    albedo: Tensor,
-    roughness: Tensor,
-    directions: Tensor,
-    f0: Tensor,
-    solid_angle: float,
-) -> Tensor:
+@differentiable(
+    "map* visibility indirect index normal* wo albedo* roughness* directions f0*",
+    "float solid_angle",
+    optional="map normal",
+)
+def _shade_map(map, visibility, indirect, index, normal, *_):
     return torch.empty_like(normal)
 
 
@@ -286,16 +269,13 @@ def specular_response(
         roughness=(roughness, "N"),
         directions=(directions, "D 3"),
     )
-    if not solid_angle > 0:
-        raise ValueError(f"specular_response: solid_angle must be above 0, got {solid_angle}")
-    if not 0 <= f0 <= 1:
-        raise ValueError(f"specular_response: f0 must be in [0, 1], got {f0}")
+    check_numbers("specular_response", "above 0", solid_angle=solid_angle)
+    check_numbers("specular_response", "in [0, 1]", f0=f0)
     if not native.serves(normal):
         return specular_response_reference(normal, wo, roughness, directions, solid_angle, f0)
     response = normal.new_empty(sizes["N"], sizes["D"])
     inputs = [x.contiguous() for x in (normal, wo, roughness, directions)]
-    options = float(f0), float(solid_angle), native.threads()
-    native.require().specular_response(*native.arrays(*inputs, response), *options)
+    native.call("specular_response", *inputs, response, float(f0), float(solid_angle))
     return response
 
 

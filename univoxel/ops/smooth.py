@@ -9,7 +9,7 @@ from torch import Tensor
 
 from univoxel.core.records import Bricks
 from univoxel.ops import native
-from univoxel.ops.differentiable import check, check_bricks
+from univoxel.ops.differentiable import check, check_numbers
 
 
 @torch.no_grad()
@@ -39,25 +39,20 @@ def smooth_rows_(
     Raises:
         TypeError, ValueError: an argument has another size, dtype, device or range than above.
     """
-    if bricks is not None:
-        check_bricks("smooth_rows_", bricks, grid=(grid, "R C"))
     of_grid = "X Y Z C" if bricks is None else "R C"
-    check("smooth_rows_", grid=(grid, of_grid), rows=(rows, "K", torch.int64))
+    check("smooth_rows_", bricks, grid=(grid, of_grid), rows=(rows, "K", torch.int64))
     if order not in (1, 2):
         raise ValueError(f"smooth_rows_: order must be 1 or 2, got {order}")
-    if not 0 <= amount <= 1:
-        raise ValueError(f"smooth_rows_: amount must be in [0, 1], got {amount}")
+    check_numbers("smooth_rows_", "in [0, 1]", amount=amount)
     if not grid.is_contiguous():
         raise ValueError("smooth_rows_: grid is changed in place, so it must be contiguous")
     if not native.serves(grid):
         return smooth_rows_reference_(grid, rows, amount, order, bricks)
-    core, rows = native.require(), rows.contiguous()
-    options = (float(amount), order, native.threads())
+    rest = rows.contiguous(), float(amount), order
     if bricks is None:
-        core.smooth_rows(*native.arrays(grid, rows), *options)
+        native.call("smooth_rows", grid, *rest)
     else:
-        where = (*native.arrays(bricks.table, bricks.place), bricks.size)
-        core.smooth_brick_rows(grid.detach().numpy(), *where, rows.numpy(), *options)
+        native.call("smooth_brick_rows", grid, bricks.table, bricks.place, bricks.size, *rest)
     return grid
 
 
@@ -111,24 +106,19 @@ def diffuse_rows_(
         TypeError, ValueError: an argument has another size, dtype, device or range than above.
     """
     check("diffuse_rows_", values=(values, "K"), rows=(rows, "K", torch.int64))
-    if not 0 <= amount <= 1:
-        raise ValueError(f"diffuse_rows_: amount must be in [0, 1], got {amount}")
-    if passes < 0:
-        raise ValueError(f"diffuse_rows_: passes must be at least 0, got {passes}")
+    check_numbers("diffuse_rows_", "in [0, 1]", amount=amount)
+    check_numbers("diffuse_rows_", "at least 0", passes=passes)
     if len(size) != 3 or (bricks is not None and tuple(size) != tuple(bricks.size)):
         raise ValueError(f"diffuse_rows_: size must be the size [X, Y, Z] of the grid, got {size}")
     if not values.is_contiguous():
         raise ValueError("diffuse_rows_: values are changed in place, so they must be contiguous")
     if not native.serves(values):
         return diffuse_rows_reference_(values, rows, size, amount, passes, bricks)
-    core, of_rows = native.require(), rows.contiguous().numpy()
-    options = (float(amount), int(passes), native.threads())
-    changed = values.detach().numpy()
+    rest = list(size), rows.contiguous(), float(amount), int(passes)
     if bricks is None:
-        core.diffuse_rows(changed, list(size), of_rows, *options)
+        native.call("diffuse_rows", values, *rest)
     else:
-        where = (*native.arrays(bricks.table, bricks.place), list(size))
-        core.diffuse_brick_rows(changed, *where, of_rows, *options)
+        native.call("diffuse_brick_rows", values, bricks.table, bricks.place, *rest)
     return values
 
 

@@ -89,12 +89,7 @@ class VisibilityScene:
         if scene is None:
             return occluded_reference(self.vertices, self.faces, origin, direction, t_min, t_max)
         out = torch.empty(len(origin), dtype=torch.bool)
-        scene.occluded(
-            *native.arrays(origin.contiguous(), direction.contiguous(), out),
-            t_min,
-            t_max,
-            native.threads(),
-        )
+        native.call(scene.occluded, origin.contiguous(), direction.contiguous(), out, t_min, t_max)
         return out
 
     def closest_hit(
@@ -114,14 +109,8 @@ class VisibilityScene:
             torch.empty(len(origin), dtype=torch.int64),
             origin.new_empty(len(origin), 2),
         )
-        scene.closest_hit(
-            *native.arrays(
-                origin.contiguous(), direction.contiguous(), hit.t, hit.face, hit.barycentric
-            ),
-            t_min,
-            t_max,
-            native.threads(),
-        )
+        rays, filled = (origin, direction), (hit.t, hit.face, hit.barycentric)
+        native.call(scene.closest_hit, *(r.contiguous() for r in rays), *filled, t_min, t_max)
         return hit
 
     def native(self) -> Any:
@@ -130,8 +119,7 @@ class VisibilityScene:
             return None
         if self._native is None:
             core = native.require_embree('VisibilityScene outside of use_backend("reference")')
-            arrays = native.arrays(self.vertices, self.faces)
-            self._native = core.VisibilityScene(*arrays, native.threads())
+            self._native = native.call(core.VisibilityScene, self.vertices, self.faces)
         return self._native
 
 

@@ -188,8 +188,7 @@ def trace(
 # Vertices of the mesh whose colour is looked up in the photographs; the others of a larger mesh
 # take that of the nearest, for memory. Meshes of the presets have fewer
 VERTICES = 300_000
-# Metallic from which on the stages before have taken a point for metal
-METALLIC_BEFORE = 0.2
+METALLIC_BEFORE = 0.2  # metallic from which on the stages before have taken a point for metal
 # Share of the surface that they have to take for metal for more of it to be expected. Of objects
 # all of metal they take a third and more, of wood and paint next to nothing
 LIKELY = 0.15
@@ -255,11 +254,7 @@ class MaterialLabels:
 @torch.no_grad()
 def build_problem(scene: Scene, photos: Photos, cfg: JointConfig, seed: int) -> JointProblem:
     """The problem of a scene with a map: points of its surface, their observations, and what light
-    can reach them.
-
-    Raises:
-        NoSurface: there is no surface, or no photograph sees it.
-    """
+    can reach them. NoSurface if there is none, or no photograph sees it."""
     assert scene.sky is not None  # the configuration has seen to it
     generator = torch.Generator().manual_seed(seed)
     mesh = extract_mesh(scene)

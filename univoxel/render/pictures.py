@@ -170,20 +170,16 @@ def shrunk(photos: Photos, view: int, width: int, height: int) -> Tensor:
 
 
 def preview(
-    scene: Scene, photos: Photos, path: Path, view: int = 0, albedo_near: AlbedoNear | None = None
+    scene: Scene, photos: Photos, path: Path, albedo_near: AlbedoNear | None = None
 ) -> None:
-    """One photograph beside what the scene says of it: photo, render, albedo, roughness, normal.
-
-    Args:
-        albedo_near: what gives the albedo, in place of the field.
-    """
-    width, height = photos.cameras.size(view)
-    surface, wo = surface_of_view(scene, photos.cameras, view, albedo_near)
-    color, alpha = photos.picture(view)
+    """The first photograph beside what the scene says of it: render, albedo, roughness, normal."""
+    width, height = photos.cameras.size(0)
+    surface, wo = surface_of_view(scene, photos.cameras, 0, albedo_near)
+    color, alpha = photos.picture(0)
     opacity = surface.opacity[:, None]
     tiles = [
         linear_to_srgb(color * alpha[..., None]),
-        linear_to_srgb(shade_hits(scene, surface, wo, view)),
+        linear_to_srgb(shade_hits(scene, surface, wo, 0)),
         linear_to_srgb(surface.albedo * opacity),
         surface.roughness[:, None].expand(-1, 3) * opacity,
         (0.5 + 0.5 * surface.normal) * opacity,

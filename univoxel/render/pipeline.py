@@ -51,11 +51,8 @@ def occlusion_rays(scene: Scene, surface: Surface, wi: Tensor) -> tuple[Tensor, 
 def trace_and_shade(
     scene: Scene, start: Tensor, away: Tensor, tracer: VisibilityScene | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Which of M rays meet nothing [M], and the radiance [M, 3] that comes from what others meet.
-
-    Args:
-        tracer: of another mesh than the scene's own.
-    """
+    """Which of M rays meet nothing [M], and the radiance [M, 3] that comes from what others meet:
+    the scene's own surface, or the tracer's mesh."""
     hit = (tracer or scene.occluder()).closest_hit(start, away)
     blocked = (hit.face >= 0).nonzero()[:, 0]
     indirect = torch.zeros_like(away)
@@ -126,12 +123,8 @@ def in_light_frame(scene: Scene, surface: Surface, wo: Tensor) -> tuple[Surface,
 def radiance_of(
     scene: Scene, surface: Surface, wo: Tensor, view: Tensor | int | None = None
 ) -> Tensor:
-    """What the radiance head says that the surface sends along wo: [N, 3], sRGB-encoded.
-
-    Args:
-        wo: [N, 3] unit, towards the eye.
-        view: as in `shade`.
-    """
+    """What the radiance head says that the surface sends along wo [N, 3]: [N, 3], sRGB-encoded;
+    view as in `shade`."""
     surface, wo = in_light_frame(scene, surface, wo)
     encoded = scene.radiance(scene.coded(surface.features, view), surface.normal, wo)
     if scene.views is None:
@@ -194,11 +187,7 @@ def shade_hits(scene: Scene, surface: Surface, wo: Tensor, view: int | None = No
 def surface_of_view(
     scene: Scene, cameras: Cameras, view: int, albedo_near: AlbedoNear | None = None
 ) -> tuple[Surface, Tensor]:
-    """Surface at every pixel of a view, row by row [H * W], and wo [H * W, 3].
-
-    Args:
-        albedo_near: what gives the albedo, in place of the field.
-    """
+    """Surface at every pixel of a view, row by row [H * W], and wo [H * W, 3]."""
     rays = image_rays(cameras, view)
     parts = [
         surface_at(scene, Rays(o, d))
@@ -217,11 +206,8 @@ def surface_of_view(
 
 @torch.no_grad()
 def extract_mesh(scene: Scene) -> Mesh:
-    """The zero level of the field's sdf as triangles, with materials decoded at the vertices.
-
-    Raises:
-        ValueError: the sdf has no zero level.
-    """
+    """The zero level of the field's sdf as triangles, with materials decoded at the vertices;
+    NoSurface if there is none."""
     vertices, faces = scene.field.isosurface()
     parts = []
     for points in vertices.split(RAYS_AT_ONCE):

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import get_args
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
@@ -17,7 +17,7 @@ from univoxel.camera import Cameras, image_rays
 from univoxel.color import linear_to_srgb, luminance
 from univoxel.core.choices import BOUNCES, SAMPLES, Background
 from univoxel.core.records import Mesh, Rays, Surface
-from univoxel.errors import UserError
+from univoxel.errors import demand
 from univoxel.ops import EnvTables, PointLight, Sun, VisibilityScene, relight
 
 FIRST_PASS = 4  # samples of either half of the first pass towards a noise limit
@@ -83,27 +83,21 @@ def relight_surface(
     rgb = surface.position.new_zeros(len(hit), 3)
     metallic = None if surface.metallic is None else surface.metallic[hit]
     diffuse, f0 = split(surface.albedo[hit], metallic)
-    mesh, mesh_f0 = _layers(traced.mesh)
-    rgb[hit] = relight(
-        traced.visibility,
-        mesh,
-        lighting.tables,
-        surface.position[hit],
-        surface.normal[hit],
-        wo[hit],
-        diffuse,
-        surface.roughness[hit],
-        f0=f0,
-        mesh_f0=mesh_f0,
-        offset=traced.offset,
-        samples=samples,
-        bounces=bounces,
-        suns=lighting.suns,
-        point_lights=lighting.point_lights,
-        first=first,
-        seed=seed,
-    )
+    places = surface.position[hit], surface.normal[hit], wo[hit], diffuse, surface.roughness[hit]
+    how = {"samples": samples, "bounces": bounces, "first": first, "seed": seed}
+    rgb[hit] = _relit(traced, lighting, *places, f0=f0, **how)
     return rgb
+
+
+def _relit(traced: TracedMesh, lighting: Lighting, *places: Tensor, **how: Any) -> Tensor:
+    """`univoxel.ops.relight` of places under all light, which the mesh blocks and sends on."""
+    mesh, mesh_f0 = traced.mesh, F0
+    if mesh.albedo is not None:
+        diffuse, mesh_f0 = split(mesh.albedo, mesh.metallic)
+        mesh = replace(mesh, albedo=diffuse)
+    more = {"suns": lighting.suns, "point_lights": lighting.point_lights, "mesh_f0": mesh_f0}
+    how = {"offset": traced.offset, **more, **how}
+    return relight(traced.visibility, mesh, lighting.tables, *places, **how)
 
 
 @torch.no_grad()
@@ -135,8 +129,7 @@ def relight_until(
             MOST_SAMPLES are reached.
         report: called after each pass with the share of the work that is done, as estimated.
     """
-    if not noise > 0:
-        raise UserError(f"relight: noise must be above 0, got {noise}", "noise")
+    demand(noise > 0, "noise", "above 0", noise)
     weight = surface.opacity[surface.opacity > 0]
     halves = [torch.zeros_like(surface.position) for _ in range(2)]
     done, more = 0, FIRST_PASS
@@ -205,14 +198,6 @@ def ground_shadow(
     return shadow
 
 
-def _layers(mesh: Mesh) -> tuple[Mesh, Tensor | float]:
-    """The mesh with the albedo of its diffuse base, and its F0."""
-    if mesh.albedo is None:
-        return mesh, F0
-    diffuse, f0 = split(mesh.albedo, mesh.metallic)
-    return replace(mesh, albedo=diffuse), f0
-
-
 def _floor(
     points: Tensor,
     *,
@@ -226,28 +211,11 @@ def _floor(
     """Luminance [N] that points of a white floor send up, without the object and with it."""
     up = torch.tensor([0.0, 0.0, 1.0]).expand_as(points)
     nothing = VisibilityScene(torch.empty(0, 3), torch.empty(0, 3, dtype=torch.int32))
-    mesh, mesh_f0 = _layers(traced.mesh)
+    floor = points, up, up, torch.ones_like(points), torch.ones(len(points))
+    how = {"f0": 0.0, "offset": 0.0, "first": first, "samples": samples, "seed": seed}
     alone, lit = (
-        relight(
-            visibility,
-            mesh,
-            lighting.tables,
-            points,
-            up,
-            up,
-            torch.ones_like(points),
-            torch.ones(len(points)),
-            offset=0.0,
-            bounces=reflections,
-            suns=lighting.suns,
-            point_lights=lighting.point_lights,
-            f0=0.0,
-            mesh_f0=mesh_f0,
-            first=first,
-            samples=samples,
-            seed=seed,
-        )
-        for visibility, reflections in ((nothing, 0), (traced.visibility, bounces))
+        _relit(replace(traced, visibility=v), lighting, *floor, bounces=reflections, **how)
+        for v, reflections in ((nothing, 0), (traced.visibility, bounces))
     )
     return luminance(alone), luminance(lit)
 
@@ -257,11 +225,7 @@ def _floor(
 
 @dataclass(frozen=True)
 class Quality:
-    """How a frame is made.
-
-    Raises:
-        UserError: a field is out of range.
-    """
+    """How a frame is made; a UserError for a field out of range."""
 
     samples: int = SAMPLES  # of the light, per pixel; >= 1
     noise: float | None = None  # instead: samples until `relight_until` finds less; > 0
@@ -270,19 +234,14 @@ class Quality:
     ground: float | None = None  # z of a floor that catches the shadow, world units
 
     def __post_init__(self) -> None:
-        noise, ground, known = self.noise, self.ground, get_args(Background)
-        allowed = {
-            "samples must be at least 1": self.samples >= 1,
-            "samples must be at most 2^31": self.samples <= 2**31,
-            "noise must be above 0": noise is None or noise > 0,
-            "bounces must be at least 0": self.bounces >= 0,
-            "background must be transparent, map or black": self.background in known,
-            "ground must be finite": ground is None or math.isfinite(ground),
-        }
-        for said, ok in allowed.items():
-            if not ok:
-                name = said.split()[0]
-                raise UserError(f"relight: {said}, got {getattr(self, name)!r}", name)
+        noise, ground, behind = self.noise, self.ground, self.background
+        demand(self.samples >= 1, "samples", "at least 1", self.samples)
+        demand(self.samples <= 2**31, "samples", "at most 2^31", self.samples)
+        demand(noise is None or noise > 0, "noise", "above 0", noise)
+        demand(self.bounces >= 0, "bounces", "at least 0", self.bounces)
+        known = "transparent, map or black"
+        demand(behind in get_args(Background), "background", known, repr(behind))
+        demand(ground is None or math.isfinite(ground), "ground", "finite", ground)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from univoxel.core.records import Rays, Surface
 from univoxel.data import Photos
 from univoxel.errors import UserError
 from univoxel.fields.distances import DenseDistances
-from univoxel.fields.features import FEWEST_ROWS, PER_LEVEL, ROWS, NodeFeatures
+from univoxel.fields.field import FEWEST_ROWS, PER_LEVEL, ROWS, NodeField
 from univoxel.fields.grid import fit_grid
 from univoxel.ops.networks import MLP, DirectionTable
 from univoxel.render.pipeline import radiance_of, shade, surface_at
@@ -344,14 +344,14 @@ def _direction_bytes(levels: int) -> int:
 def _node_bytes(scene: Scene) -> int:
     """Of a node near the surface: number of its row and distance, in halves; and, where features
     are of nodes, its number again and features."""
-    features = 4 + 2 * scene.cfg.channels if isinstance(scene.field.encoding, NodeFeatures) else 0
+    features = 4 + 2 * scene.cfg.channels if isinstance(scene.field, NodeField) else 0
     return 4 + 2 + features
 
 
 def _bytes_apart_from_grid(scene: Scene) -> int:
     rest = (x for name, x in scene.state_dict().items() if not name.startswith(TABLES))
     names = NAME_BYTES * len(scene.cfg.views)
-    rows = 0 if isinstance(scene.field.encoding, NodeFeatures) else len(scene.field.features)
+    rows = 0 if isinstance(scene.field, NodeField) else len(scene.field.features)
     rows_bytes = ROW_BYTES * rows + _direction_bytes(scene.cfg.mirror_levels)
     return HEADER_BYTES + names + rows_bytes + sum(x.numel() * x.element_size() for x in rest)
 
@@ -485,7 +485,7 @@ def reduce_storage_(
     choices = []
     if isinstance(scene.field.distances, DenseDistances):
         choices.append(shortest_reach(scene, held_out))
-    if not isinstance(scene.field.encoding, NodeFeatures):
+    if not isinstance(scene.field, NodeField):
         far = (chosen_reach(choices) or SHELL) * scene.field.voxel_size
         probes = (  # drawn one by one: each is dropped before the next is
             reference_rays(photos, pixels[torch.randperm(len(pixels))[:ROW_PROBE_RAYS]])

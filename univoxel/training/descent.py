@@ -44,7 +44,7 @@ def smooth_touched_(field: Field, stage: StageConfig, every: int) -> None:
     assert features.grad is not None
     plate, diffusion = stage.plate * every, stage.diffusion * every
     field.distances.smooth_rows_(sdf.detach(), rows_of(sdf.grad), plate, order=2)
-    field.encoding.smooth_(field.distances, rows_of(features.grad), diffusion)
+    field.smooth_features_(rows_of(features.grad), diffusion)
 
 
 # Holds a training where its numbers fail: drops the step, goes back to a good state, says so.

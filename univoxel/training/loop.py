@@ -119,7 +119,7 @@ def run_stage(
                 continue
             shown |= {name: term.detach() for name, term in terms.items()}
             if stage.refit:
-                field.encoding.hold_channels_(scene.material.channels)
+                field.hold_channels_(scene.material.channels)
             if stage.spread:
                 descent.smooth_sdf_gradient_(field, stage.spread)
             optimizer.step()

@@ -13,8 +13,7 @@ import torch
 from univoxel.camera import Cameras
 from univoxel.config import StageConfig, TrainConfig
 from univoxel.data import Photos
-from univoxel.fields.features import PER_LEVEL, Levels
-from univoxel.fields.field import hash_field
+from univoxel.fields.field import PER_LEVEL, Levels, hash_field
 from univoxel.fields.grid import fit_grid
 from univoxel.lights import SGConfig
 from univoxel.scene import Scene, SceneConfig
