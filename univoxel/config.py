@@ -260,6 +260,7 @@ def load_config(path: Path) -> TrainConfig:
         if not isinstance(values, dict):
             raise ConfigError(f"expected a JSON object of settings, got {values!r:.60}")
         values = {name: value for name, value in values.items() if name != "version"}
+        values.setdefault("voxel_pixels", 0.0)  # configurations from before there were any
         if isinstance(values.get("scene"), dict):
             values["scene"] = dict(values["scene"])
             values["scene"]["light"] = read_config(values["scene"].get("light", {}))
@@ -273,8 +274,6 @@ def check_same(cfg: TrainConfig) -> None:
     path = cfg.out / "config.json"
     try:
         before = load_config(path)
-        if "voxel_pixels" not in read_json(path):  # of configurations from before there were any
-            before = dataclasses.replace(before, voxel_pixels=0.0)
     except (OSError, UserError) as error:
         raise UserError(f"{path}: this run cannot be resumed: {error}") from None
     # 0 was 1 before it was found

@@ -273,13 +273,14 @@ def view_truth(photos: Photos, view: int) -> Truth:
 
 # The metrics of a trained scene, and their definitions.
 #
-# - albedo_psnr_raw, _1ch, _3ch: albedo as it is; with one scale; with a scale per channel. -
-# albedo_psnr_fg: as _3ch, over the pixels of the mask only. - relit_psnr: rendered with the albedo
-# times the scale per channel, clipped to 1, on the surface   and on what it sees of itself;
-# relit_psnr_raw: with the albedo as it is. - chamfer: samples of the mesh against points of the
-# true surface. - trust_spearman: of the expected error (see `univoxel.evaluation.confidence`) and
-# the true one over the pixels of the mask in all views: of the albedo, with a scale per channel,
-# mean absolute difference in sRGB; of the roughness, absolute difference; of normals, the angle.
+# - albedo_psnr_raw, _1ch, _3ch: albedo as it is; with one scale; with a scale per channel.
+# - albedo_psnr_fg: as _3ch, over the pixels of the mask only.
+# - relit_psnr: rendered with the albedo times the scale per channel, clipped to 1, on the surface
+#   and on what it sees of itself; relit_psnr_raw: with the albedo as it is.
+# - chamfer: samples of the mesh against points of the true surface.
+# - trust_spearman: of the expected error (see `univoxel.evaluation.confidence`) and the true one
+#   over the pixels of the mask in all views: of the albedo, with a scale per channel, mean absolute
+#   difference in sRGB; of the roughness, absolute difference; of normals, the angle.
 
 
 # Description of each key in the table
