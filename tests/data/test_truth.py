@@ -125,7 +125,7 @@ def test_points(tmp_path):
         ),
         ({"points": np.zeros((2, 2))}, r"got points \[2, 2\]"),
         ({"points": np.zeros((0, 3))}, r"got points \[0, 3\]"),
-        ({"points": np.full((2, 3), np.inf)}, "points contain NaN or infinity"),
+        ({"points": np.full((2, 3), np.inf)}, "expected finite points"),
         ({}, "got no arrays"),
     ],
 )

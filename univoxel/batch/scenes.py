@@ -34,11 +34,8 @@ PER_PIXEL = 7  # bytes of a photograph and its alpha
 
 
 def named(scenes: Sequence[Path]) -> dict[str, Path]:
-    """Absolute paths of scenes by the names of their folders.
-
-    Raises:
-        UserError: none, two of one name, one that is not there, or one of a name that is taken.
-    """
+    """Absolute paths of scenes by the names of their folders; a UserError of none, two of one name,
+    one that is not there, or one of a name that is taken."""
     found: dict[str, Path] = {}
     for path in (scene.resolve() for scene in scenes):
         name = path.stem if path.is_file() else path.name
@@ -137,11 +134,7 @@ def result_of(job: Job, data: Path, out: Path, ended: Result | None = None) -> S
 def write_results(
     results: Sequence[SceneResult], options: Mapping[str, Any], out: Path, other: Path | None = None
 ) -> None:
-    """Write batch.json and batch.csv, each whole or not at all.
-
-    Args:
-        other: one more file for what batch.json holds.
-    """
+    """Write batch.json, once more as `other`, and batch.csv, each whole or not at all."""
     record = {"options": dict(options), "scenes": [dataclasses.asdict(r) for r in results]}
     for path in (out / "batch.json", *([other] if other else [])):
         write_json(path, record)

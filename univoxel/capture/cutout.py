@@ -64,6 +64,10 @@ class MaskTile:
     before: Tensor  # [h, w, 3] in [0, 1], from `darkened`
     after: Tensor | None  # the same with the repaired mask
 
+    @property
+    def title(self) -> str:
+        return self.name + ("" if self.agreement is None else f"  {self.agreement:.2f}")
+
 
 def darkened(photograph: Tensor, mask: Tensor) -> Tensor:
     """A small picture [h, w, 3] in [0, 1] of a photograph [H, W, 3], dark outside its mask [H, W].
@@ -101,21 +105,17 @@ def mask_sheet(tiles: Sequence[MaskTile]) -> np.ndarray:
         after = picture is tile.after
         colour = "orange" if tile.fault and not after else "white"
         words = "repaired" if after else tile.fault
-        draw.text((x + 2, y + 1), f"{tile.name}{_number(tile)}", colour, font)
+        draw.text((x + 2, y + 1), tile.title, colour, font)
         draw.text((x + 2, y + 16), words, colour, font)
         sheet.paste(Image.fromarray(_bytes(picture).numpy()), (x, y + LABEL))
     return np.asarray(sheet)
 
 
 def write_page(path: Path, tiles: Sequence[MaskTile], about: str) -> None:
-    """A page that holds its pictures and needs no other file.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write a page that holds its pictures and needs no other file."""
     figures = []
     for tile in tiles:
-        words = escape(f"{tile.name}{_number(tile)} {tile.fault}")
+        words = escape(f"{tile.title} {tile.fault}")
         images = [image(picture) for picture in (tile.before, tile.after) if picture is not None]
         kind = ' class="wrong"' if tile.fault else ""
         repaired = "" if tile.after is None else "; the corrected mask is on the right"
@@ -124,10 +124,6 @@ def write_page(path: Path, tiles: Sequence[MaskTile], about: str) -> None:
     main = "\n".join(["<main>", *figures, "</main>"])
     body = f"<h1>Masks</h1>\n{paragraph(about)}\n{main}"
     write_text(path, document("masks", _STYLE, body))
-
-
-def _number(tile: MaskTile) -> str:
-    return "" if tile.agreement is None else f"  {tile.agreement:.2f}"
 
 
 # Masks come from a network, from a folder, or from the depth that the photographs show, alone.
@@ -145,7 +141,18 @@ GUESSED = 0.15
 SURE = 0.5
 
 
-Masks = dict[str, list[Tensor]]  # [H, W] uint8 of each photograph of each split
+@dataclass(frozen=True)
+class _View:
+    """One photograph of a data set, to which a mask [H, W] uint8 belongs."""
+
+    split: str
+    photos: Photos  # of the split
+    number: int  # in it
+    small: Cameras  # of the split, as large as masks are judged
+
+    @property
+    def name(self) -> str:
+        return self.photos.names[self.number]
 
 
 def cutout(
@@ -195,32 +202,30 @@ def cutout(
         for name in splits_of(data)
     }
     log.info(photos.about)
+    views = []
+    for name, split in splits.items():  # train comes first
+        small = small_cameras(split.cameras)
+        views += [_View(name, split, v, small) for v in range(len(split))]
     if masked:
-        masked = timed(masked, network, sum(map(len, splits.values())))
-        masks = {
-            name: [_bytes(masked(_encoded(split, v))) for v in track(range(len(split)), "masks")]
-            for name, split in splits.items()
-        }
+        masked = timed(masked, network, len(views))
+        masks = [_bytes(masked(_encoded(v.photos, v.number))) for v in track(views, "masks")]
     elif origin == DEPTH:
         masks = _from_depth(splits, depth_maps(photos), corners, keep_table)
     else:  # of shrunk photographs those with masks are black outside of them
         read = {n: load(n, photos.downscale, masks=Path(origin)) for n in splits}
-        masks = {n: [_bytes(s.picture(v)[1]) for v in range(len(s))] for n, s in read.items()}
+        masks = [_bytes(read[v.split].picture(v.number)[1]) for v in views]
     if origin == DEPTH:  # silhouettes have nothing to say against themselves
         verdicts, told = _as_they_are(masks), "masks from depth"
     else:
-        masks = masks if corners is None else _within(splits, masks, corners)
-        verdicts, told = _judged(splits, masks, corners)
-    _write(out, splits, masks, verdicts, told)
+        if corners is not None:
+            masks = [_within(v, m, corners) for v, m in zip(views, masks, strict=True)]
+        verdicts, told = _judged(views, masks, corners)
+    _write(out, views, masks, verdicts, told)
     return out
 
 
 def check_masks(origin: str, network: str, box: Sequence[float] | None, keep_table: bool) -> None:
-    """Refuse, by a UserError, choices of masks that are inconsistent.
-
-    Args:
-        origin: where masks come from.
-    """
+    """Refuse, by a UserError, an origin of masks and choices that are inconsistent."""
     check_network(network)
     if network != NETWORK and origin not in (REMBG, "auto"):
         raise UserError(
@@ -241,7 +246,7 @@ def check_masks(origin: str, network: str, box: Sequence[float] | None, keep_tab
 
 def _from_depth(
     splits: dict[str, Photos], maps: DepthMaps, box: Tensor | None, keep_table: bool
-) -> Masks:
+) -> list[Tensor]:
     """Masks of what stands out in depth."""
     small = masks_by_depth(maps, box, keep_table)
     if small is None and box is not None:
@@ -256,21 +261,13 @@ def _from_depth(
         )
     _tell_evidence(shape, 0, box)
     log.info("masks were made from depth: check them in masks.html")
-    return {name: _silhouettes_of(shape, split) for name, split in splits.items()}
+    return [mask for split in splits.values() for mask in _silhouettes_of(shape, split)]
 
 
-def _within(splits: dict[str, Photos], masks: Masks, box: Tensor) -> Masks:
-    """Masks that show nothing beside the box."""
-
-    def cut(cameras: Cameras, view: int, mask: Tensor) -> Tensor:
-        shown = grown(object_shape.box_shown(cameras, view, box)).float()[None, None]
-        return mask * interpolate(shown, (mask.shape[0], mask.shape[1]))[0, 0].byte()
-
-    found = {}
-    for name, split in splits.items():
-        cameras = small_cameras(split.cameras)
-        found[name] = [cut(cameras, view, mask) for view, mask in enumerate(masks[name])]
-    return found
+def _within(view: _View, mask: Tensor, box: Tensor) -> Tensor:
+    """A mask that shows nothing beside the box."""
+    shown = grown(object_shape.box_shown(view.small, view.number, box)).float()[None, None]
+    return mask * interpolate(shown, (mask.shape[0], mask.shape[1]))[0, 0].byte()
 
 
 def _tell_evidence(shape: object_shape.ObjectShape, count: int, box: Tensor | None) -> None:
@@ -296,98 +293,78 @@ def _silhouettes_of(shape: object_shape.ObjectShape, photos: Photos) -> list[Ten
     return found
 
 
-def _as_they_are(masks: Masks) -> dict[str, list[Verdict]]:
-    return {name: [Verdict(None, "", mask) for mask in those] for name, those in masks.items()}
+def _as_they_are(masks: Sequence[Tensor]) -> list[Verdict]:
+    return [Verdict(None, "", mask) for mask in masks]
 
 
 def _judged(
-    splits: dict[str, Photos], masks: Masks, box: Tensor | None
-) -> tuple[dict[str, list[Verdict]], str]:
+    views: Sequence[_View], masks: Sequence[Tensor], box: Tensor | None
+) -> tuple[list[Verdict], str]:
     """What the object's silhouettes say about each mask, repaired if it may be, and what to tell
-    people.
-
-    Raises:
-        DataError: a mask shows nothing, and there are too few to check it.
-        UserError: the masks have nothing in common, or nothing in the box.
-    """
-    train, count = splits["train"], len(splits["train"])
+    people; a UserError where masks have nothing in common, or show nothing."""
+    train = views[0].photos
+    count = len(train)
     if count < PHOTOGRAPHS:
-        for name, split in splits.items():
-            for stem, one in zip(split.names, masks[name], strict=True):
-                if not bool((one >= 128).any()):
-                    where = "" if box is None else " inside the box"
-                    raise DataError(
-                        f"{split.folder}: the mask of {stem} is empty{where}: correct it"
-                    )
+        for view, mask in zip(views, masks, strict=True):
+            if not bool((mask >= 128).any()):
+                where = "" if box is None else " inside the box"
+                raise DataError(
+                    f"{train.folder}: the mask of {view.name} is empty{where}: correct it"
+                )
         log.warning(
             "masks are not checked, because this needs %d photographs and there are only %d",
             *(PHOTOGRAPHS, count),
         )
         return _as_they_are(masks), "masks are not checked, because there are too few photographs"
-    coverage = {name: [m.float() / 255 for m in those] for name, those in masks.items()}
-    shape = object_shape.find_object(coverage["train"], depth_maps(train), box=box)
+    coverage = [mask.float() / 255 for mask in masks]
+    shape = object_shape.find_object(coverage[:count], depth_maps(train), box=box)
     _tell_evidence(shape, count, box)
-    shown = {
-        n: list(object_shape.silhouettes(shape, small_cameras(s.cameras)))
-        for n, s in splits.items()
-    }
+    cameras = {view.split: view.small for view in views}
+    shown = [one for those in cameras.values() for one in object_shape.silhouettes(shape, those)]
     agreements = [
         iou(object_shape.shrunk(mask, one.shape[1], one.shape[0]) >= 0.5, one)
-        for mask, one in zip(coverage["train"], shown["train"], strict=True)
+        for mask, one in zip(coverage[:count], shown[:count], strict=True)
     ]
     usual = statistics.median(agreements)
     # All may keep the same table: then the box says what is wrong, and not the others
     expected = usual if box is None else 1.0
-    verdicts = {}
-    for name, split in splits.items():
-        cameras = small_cameras(split.cameras)
-        verdicts[name] = []
-        for view, mask in enumerate(track(coverage[name], "repairing masks")):
-            voxel = voxel_pixels(shape.grid, cameras, view)
-            found = judge(mask, shown[name][view], expected, voxel)
-            kept = masks[name][view] if not found.fault else _bytes(found.mask)
-            verdicts[name].append(replace(found, mask=kept))
-    wrong = sum(bool(v.fault) and (box is None or v.fault == MISSING) for v in verdicts["train"])
-    told = _told(splits, verdicts, usual)
+    verdicts = []
+    for k, view in enumerate(track(views, "repairing masks")):
+        voxel = voxel_pixels(shape.grid, view.small, view.number)
+        found = judge(coverage[k], shown[k], expected, voxel)
+        verdicts.append(replace(found, mask=_bytes(found.mask) if found.fault else masks[k]))
+    wrong = sum(bool(v.fault) and (box is None or v.fault == MISSING) for v in verdicts[:count])
+    told = _told(views, verdicts, usual)
     if 2 * wrong > count and shape.surface < SURE:
         told += "; no mask was corrected, because the estimated shape may be wrong"
         log.warning(
             f"{told}. Perhaps all masks have the same fault, or the cameras are wrong: check "
             "masks.html"
         )
-        for name, those in verdicts.items():
-            kept = zip(those, masks[name], strict=True)
-            verdicts[name] = [replace(verdict, mask=one) for verdict, one in kept]
-        return verdicts, told
-    if any(v.fault for those in verdicts.values() for v in those):
+        return [replace(v, mask=m) for v, m in zip(verdicts, masks, strict=True)], told
+    if any(verdict.fault for verdict in verdicts):
         told += "; these were corrected from the other photographs, so check masks.html"
     log.info(told)
     return verdicts, told
 
 
-def _told(splits: dict[str, Photos], verdicts: dict[str, list[Verdict]], usual: float) -> str:
+def _told(views: Sequence[_View], verdicts: Sequence[Verdict], usual: float) -> str:
     """How many masks agree with the object's silhouettes, and what is wrong with the others."""
-    faults = [
-        (stem, verdict.fault)
-        for name, split in splits.items()
-        for stem, verdict in zip(split.names, verdicts[name], strict=True)
-    ]
     said = {BESIDE: "include more than the object", MISSING: "miss part of the object"}
-    parts = [
-        f"{len(stems)} {words} ({some(stems)})"
-        for fault, words in said.items()
-        if (stems := [stem for stem, found in faults if found == fault])
-    ]
-    count, wrong = len(faults), sum(bool(fault) for _, fault in faults)
+    parts = []
+    for fault, words in said.items():
+        stems = [v.name for v, found in zip(views, verdicts, strict=True) if found.fault == fault]
+        parts += [f"{len(stems)} {words} ({some(stems)})"] if stems else []
+    count, wrong = len(views), sum(bool(verdict.fault) for verdict in verdicts)
     told = f"masks: {count - wrong} of {count} agree with the object's silhouette (IoU {usual:.2f})"
     return f"{told}; {wrong} do not: {', '.join(parts)}" if wrong else told
 
 
 def _write(
     out: Path,
-    splits: dict[str, Photos],
-    masks: Masks,
-    verdicts: dict[str, list[Verdict]],
+    views: Sequence[_View],
+    masks: Sequence[Tensor],
+    verdicts: Sequence[Verdict],
     told: str,
 ) -> None:
     """The folder, whole or not at all: photographs, cameras, and the sheet of masks."""
@@ -395,17 +372,18 @@ def _write(
     partial = out.with_name(f".{out.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     tiles = []
-    for name, split in splits.items():
-        (partial / name).mkdir(parents=True)
-        for view in track(range(len(split)), f"writing {name}"):
-            before, verdict, stem = masks[name][view], verdicts[name][view], split.names[view]
-            write_photo(partial / name / stem, split, view, verdict.mask.float() / 255)
-            photograph = _encoded(split, view)
-            shown, after = darkened(photograph, before.float() / 255), None
-            if not torch.equal(before, verdict.mask):
-                after = darkened(photograph, verdict.mask.float() / 255)
-            tiles.append(MaskTile(f"{name}/{stem}", verdict.agreement, verdict.fault, shown, after))
-        write_cameras(partial, name, split.cameras, split.names)
+    for k, view in enumerate(track(views, "writing")):
+        place, before, verdict = partial / view.split, masks[k], verdicts[k]
+        if not view.number:
+            place.mkdir(parents=True)
+            write_cameras(partial, view.split, view.photos.cameras, view.photos.names)
+        write_photo(place / view.name, view.photos, view.number, verdict.mask.float() / 255)
+        photograph = _encoded(view.photos, view.number)
+        shown, after = darkened(photograph, before.float() / 255), None
+        if not torch.equal(before, verdict.mask):
+            after = darkened(photograph, verdict.mask.float() / 255)
+        name = f"{view.split}/{view.name}"
+        tiles.append(MaskTile(name, verdict.agreement, verdict.fault, shown, after))
     tiles = worst_first(tiles)
     write_png(partial / "masks.png", mask_sheet(tiles))
     write_page(partial / "masks.html", tiles, told)

@@ -7,6 +7,7 @@ import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -193,15 +194,13 @@ def without(model: Model, numbers: set[int]) -> Model:
     """The model without some images, and without points that fewer than two others show."""
     images = [i for i in model.images if i.number not in numbers]
     p = model.points
-    kept = np.array([~np.isin(t["image"], list(numbers)) for t in p.tracks], object)
-    tracks = [t[k] for t, k in zip(p.tracks, kept, strict=True)]
+    tracks = [t[~np.isin(t["image"], list(numbers))] for t in p.tracks]
     some = np.array([len(np.unique(t["image"])) >= 2 for t in tracks], bool)
-    tracks = [t for t, s in zip(tracks, some, strict=True) if s]
+    tracks = list(compress(tracks, some))
     points = Points(p.number[some], p.position[some], p.color[some], p.error[some], tracks)
-    shown = [np.isin(i.point, points.number) for i in images]
     images = [
-        replace(i, point=np.where(there, i.point, NO_POINT))
-        for i, there in zip(images, shown, strict=True)
+        replace(i, point=np.where(np.isin(i.point, points.number), i.point, NO_POINT))
+        for i in images
     ]
     return Model(model.cameras, images, points)
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image, ImageOps
+from PIL import ExifTags, Image, ImageOps
 from scipy.ndimage import laplace
 
 from univoxel.color import linear_to_srgb, srgb_to_linear
@@ -49,8 +49,7 @@ FEWEST = 3  # pictures that are a capture; fewer beside a folder of them are pre
 NAMED = 5  # folders in a message, at most
 DIAGONAL_35MM = math.hypot(36, 24)  # millimetres
 SIDEWAYS = (5, 6, 7, 8)  # orientations of EXIF that swap width and height
-MAKE, MODEL, ORIENTATION, DETAILS = 0x010F, 0x0110, 0x0112, 0x8769
-FOCAL, FOCAL_35MM, EXIF_WIDTH, EXIF_HEIGHT = 0x920A, 0xA405, 0xA002, 0xA003
+Tag = ExifTags.Base
 SRGB_GAMMA = (2.4, 12.92)  # of a RAW's development
 BROKEN = (OSError, SyntaxError, ValueError, Image.DecompressionBombError, EOFError)
 
@@ -87,20 +86,16 @@ class Photograph:
 
 
 def find_photographs(folder: Path) -> tuple[list[Path], list[str], int]:
-    """The photographs of a folder by name, names of files that are none, and how many came twice.
+    """The photographs of a folder by name, names of files that are none, and how many came twice; a
+    DataError without any.
 
     Where the folder has none or a few beside a folder `images`, those of that. Of a photograph in
     two formats, as many cameras write it, one is taken. Masks beside photographs are none.
-
-    Raises:
-        DataError: no photographs.
     """
-    for place in (folder, folder / "images"):
-        pictures, others = _pictures(place)
-        if len(pictures) < FEWEST and place == folder and _pictures(folder / "images")[0]:
-            continue
-        if not pictures:
-            continue
+    pictures, others = _pictures(folder)
+    if len(pictures) < FEWEST and (beside := _pictures(folder / "images"))[0]:
+        pictures, others = beside
+    if pictures:
         best: dict[str, Path] = {}
         for path in sorted(pictures, key=lambda p: ORDER.index(p.suffix.lower())):
             best.setdefault(path.stem, path)
@@ -145,29 +140,26 @@ def describe(path: Path) -> Photograph:
             return Photograph(path, *((height, width) if across else (width, height)))
         with _open(path) as image:
             exif = image.getexif()
-            details = exif.get_ifd(DETAILS)
-            turned = int(exif.get(ORIENTATION, 1) or 1)
+            details = exif.get_ifd(ExifTags.IFD.Exif)
+            turned = int(exif.get(Tag.Orientation, 1) or 1)
             width, height = image.size
-            stated = sorted(_number(details.get(tag)) for tag in (EXIF_WIDTH, EXIF_HEIGHT))
-            camera = " ".join(str(exif.get(tag, "")).strip("\0 ") for tag in (MAKE, MODEL))
-            focal = _number(details.get(FOCAL)), _number(details.get(FOCAL_35MM))
+            sides = Tag.ExifImageWidth, Tag.ExifImageHeight
+            stated = sorted(_number(details.get(tag)) for tag in sides)
+            camera = " ".join(str(exif.get(tag, "")).strip("\0 ") for tag in (Tag.Make, Tag.Model))
+            lengths = Tag.FocalLength, Tag.FocalLengthIn35mmFilm
+            focal, on_film = (_number(details.get(tag)) for tag in lengths)
     except BROKEN as error:
         raise DataError(f"{path}: this photograph could not be read: {error}") from None
     whole = stated == sorted((width, height))
     if turned in SIDEWAYS:
         width, height = height, width
-    return Photograph(path, width, height, camera.strip(), focal, whole, turned)
+    return Photograph(path, width, height, camera.strip(), (focal, on_film), whole, turned)
 
 
 def read_upright(path: Path, longest: int = 0) -> Image.Image:
-    """The picture as it is meant to be looked at, sRGB: RGB, or RGBA where it has transparency.
-
-    Args:
-        longest: shrink it to at most so many pixels along the longer side; 0 for its own size.
-
-    Raises:
-        DataError: it cannot be read to its end.
-    """
+    """The picture as it is meant to be looked at, sRGB: RGB, or RGBA where it has transparency; at
+    most so many pixels along the longer side, or 0 for its own size. A DataError where it cannot be
+    read to its end."""
     try:
         if path.suffix.lower() in RAW:
             return shrunk_to(_develop(path, longest), longest)
@@ -177,11 +169,11 @@ def read_upright(path: Path, longest: int = 0) -> Image.Image:
                 image.draft(None, size)
             image.load()
             picture = srgb_of(shrunk_to(_eight_bits(image), longest), image)
-            orientation = image.getexif().get(ORIENTATION, 1)
+            orientation = image.getexif().get(Tag.Orientation, 1)
     except BROKEN as error:
         raise DataError(f"{path}: this photograph could not be read: {error}") from None
     picture.info.pop("icc_profile", None)
-    picture.getexif()[ORIENTATION] = orientation
+    picture.getexif()[Tag.Orientation] = orientation
     return ImageOps.exif_transpose(picture)
 
 
@@ -291,13 +283,11 @@ def require_ffmpeg() -> None:
 
 
 def write_frames(video: Path, folder: Path, every: float | None = None) -> int:
-    """Write frames as FOLDER/frame_00000.jpg ..., turned as the video says; return how many.
+    """Write frames as FOLDER/frame_00000.jpg ..., turned as the video says; return how many. A
+    DataError where the video cannot be read.
 
     The sharpest of each `every` seconds is taken, of LOOKS that are looked at, and none twice where
     the picture stands still. By default so many seconds that KEPT are.
-
-    Raises:
-        DataError: the video cannot be read.
     """
     if every is None:
         every = max(1 / FASTEST, seconds(video) / KEPT)

@@ -141,11 +141,7 @@ def doubt(model: Model, image: Placed, error: float) -> float:
 
 
 def still(pairs: Sequence[tuple[int, int, int, int]]) -> tuple[int, int]:
-    """Pairs whose match is a shift only, and pairs that match at all.
-
-    Args:
-        pairs: as `model.verified_pairs` has them.
-    """
+    """Pairs whose match is a shift only, and pairs that match at all, of `model.verified_pairs`."""
     matching = [kind for *_, inliers, kind in pairs if inliers > 0]
     return sum(kind == WATERMARK for kind in matching), len(matching)
 

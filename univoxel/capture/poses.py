@@ -26,7 +26,7 @@ from univoxel.core import log
 from univoxel.core.choices import KEEP_SIZE
 from univoxel.core.files import read_json
 from univoxel.core.progress_bar import bar
-from univoxel.errors import DataError, ExistingFile, StillBackground
+from univoxel.errors import DataError, ExistingFile, StillBackground, some
 from univoxel.sphere import gaps
 
 WORK = "sfm"  # folder in the scene that the steps keep their results in
@@ -46,7 +46,6 @@ CONSTANTS_0_2: dict[str, Any] = {
     **{"contradicted_share": 0.5, "placed_share": 0.8, "gap": 60.0},
     **{"base_seconds": 120.0, "photograph_seconds": 30.0},
 }
-NAMED = 5  # photographs that a message names at most
 
 
 def poses(
@@ -91,7 +90,8 @@ def poses(
     unread += others
     told = in_words(capture.photographs, capture.groups)
     told += f"; {doubles} photographs exist in two formats, of which one is used" if doubles else ""
-    log.info(told + (f"; {len(unread)} could not be read: {_some(unread)}" if unread else ""))
+    told += f"; {len(unread)} could not be read: {some(sorted(unread))}" if unread else ""
+    log.info(told)
     settings = _settings(source, masks, every, config, capture)
     used = {"keep_size": keep_size, "keep_weak": keep_weak}
     if _begin(out, folders, settings, used):
@@ -105,7 +105,7 @@ def poses(
     ) as progress:
         unreadable = _search(capture, folders, config, settings, progress)
         model, weak, reports = _judge(capture, folders, unreadable)
-        _say(capture, model, weak, reports, keep_weak)
+        _say(model, reports, keep_weak)
         model = without(model, set(weak)) if weak and not keep_weak else model
         index = {name: i for i, name in enumerate(capture.pictures)}
         ordered = sorted(model.images, key=lambda i: index[i.name])
@@ -229,7 +229,7 @@ def _search(
             unreadable[index] = why
     if unreadable:
         names = [capture.photographs[i].path.name for i in unreadable]
-        log.warning(f"{len(names)} photographs could not be read: {_some(names)}")
+        log.warning(f"{len(names)} photographs could not be read: {some(sorted(names))}")
 
     def do(step: str, part: Callable[..., Iterator[int]], total: int) -> None:
         if not steps.done(folders.work, step, settings):
@@ -293,53 +293,39 @@ def _judge(
             reason = unreadable.get(index) or why_not
         reports.append(scene.Report(photograph, *known, partners, reason=reason))
     if len(placed) < PLACED_SHARE * len(reports):
-        missing = [f"{r.name} ({r.reason})" for r in reports if not r.placed]
         raise DataError(
             f"only {len(placed)} of {len(reports)} photographs were registered. Take more "
             "photographs, with more overlap, and do not move the object. "
-            f"Not registered: {_some(missing)}"
+            f"Not registered: {some(_explained(reports, placed=False))}"
         )
     return models[0], weak, reports
 
 
-def _say(
-    capture: Capture,
-    model: Model,
-    weak: dict[int, str],
-    reports: list[scene.Report],
-    keep_weak: bool,
-) -> None:
+def _explained(reports: list[scene.Report], placed: bool) -> list[str]:
+    """Photographs that were placed, or not, of which there is something to say, and what."""
+    return sorted(f"{r.name} ({r.reason})" for r in reports if r.placed == placed and r.reason)
+
+
+def _say(model: Model, reports: list[scene.Report], keep_weak: bool) -> None:
     """How many were placed, how well, and which not."""
     lenses = [model.cameras[c] for c in sorted({i.camera for i in model.images})]
-    shares = [f"{lens.focal[0] / lens.width:.2f}" for lens in lenses[:NAMED]]
+    shares = some([f"{lens.focal[0] / lens.width:.2f}" for lens in lenses])
     cameras = "one camera" if len(lenses) == 1 else f"{len(lenses)} cameras"
     log.info(
         f"cameras: {len(model.images)} of {len(reports)} photographs registered, mean "
         f"reprojection error {model.error:.2f} pixels, "
-        f"focal length {', '.join(shares)} times the width ({cameras})"
+        f"focal length {shares} times the width ({cameras})"
     )
-    missing = [f"{r.name} ({r.reason})" for r in reports if not r.placed]
-    if missing:
-        log.warning(f"not registered: {_some(missing)}")
-    index = {name: i for i, name in enumerate(capture.pictures)}
-    doubtful = [
-        f"{capture.photographs[index[i.name]].path.name} ({weak[i.number]})"
-        for i in model.images
-        if i.number in weak
-    ]
-    if doubtful:
+    if missing := _explained(reports, placed=False):
+        log.warning(f"not registered: {some(missing)}")
+    if doubtful := _explained(reports, placed=True):
         fate = "kept" if keep_weak else "left out (keep_weak keeps them)"
         log.warning(
             f"{len(doubtful)} photographs may have poses that are wrong by several degrees. They "
-            f"are {fate}: {_some(doubtful)}. Photograph the side that they show again, with more "
+            f"are {fate}: {some(doubtful)}. Photograph the side that they show again, with more "
             "overlap",
             extra={"arguments": ("keep_weak",)},
         )
-
-
-def _some(names: list[str]) -> str:
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return ", ".join(sorted(names)[:NAMED]) + more
 
 
 def _versions() -> dict[str, str]:

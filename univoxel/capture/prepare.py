@@ -51,11 +51,8 @@ class Capture:
 
 
 def gather(files: Sequence[Path], masks: Path | None) -> tuple[Capture, list[str]]:
-    """What was photographed with what, and names of files that cannot be read.
-
-    Raises:
-        DataError: a photograph without a mask where masks are given, or fewer than two photographs.
-    """
+    """What was photographed with what, and names of files that cannot be read; a DataError where a
+    photograph lacks its mask, or there are fewer than two photographs."""
     photographs, unread = [], []
     for path in files:
         try:
@@ -138,11 +135,7 @@ def write_pictures(
 
 
 def read_mask(capture: Capture, index: int) -> Image.Image:
-    """The mask of a photograph, upright, of its own size, grey.
-
-    Raises:
-        DataError: it cannot be read, is none, or is of another picture.
-    """
+    """The mask of a photograph, upright, of its own size, grey; a DataError as in `laid_over`."""
     assert capture.masks is not None
     path, photograph = capture.masks[index], capture.photographs[index]
     width, height = photograph.width, photograph.height

@@ -68,11 +68,8 @@ def look_at(path: Path) -> Given:
 
 
 def begin(project: Project, given: Given) -> None:
-    """Make the folder of a capture, or continue with it.
-
-    Raises:
-        ExistingFile: it holds the capture of something else, or other files.
-    """
+    """Make the folder of a capture, or continue with it; an ExistingFile where it holds the capture
+    of something else, or other files."""
     out = project.out
     if out.exists() and not out.is_dir():
         raise ExistingFile(f"{out} is a file: choose another folder for out", "out")

@@ -56,14 +56,12 @@ def require_pycolmap() -> None:
 
 
 def run(request: Request, log: Path, done: Callable[[], int] | None = None) -> Iterator[int]:
-    """Run one step and yield, while it runs, how much of it is done. It ends with this process.
+    """Run one step and yield, while it runs, how much of it is done. It ends with this process; a
+    ProcessFailed where it does not end well, or not in time.
 
     Args:
         log: file for what the process says; the request is written beside it.
         done: counts what is done; by default pictures that the log says were placed.
-
-    Raises:
-        ProcessFailed: it did not end well, or not in time.
     """
     count = done or (lambda: len(REGISTERING.findall(log.read_bytes())))
     asked = log.with_suffix(".json")

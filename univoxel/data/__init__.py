@@ -1,10 +1,12 @@
 """Photographs, cameras and ground truth from files."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from univoxel.data import colmap, photogrammetry, research, transforms
 from univoxel.data.image_cache import keep_photos, looking_in
-from univoxel.data.load_images import read_shots
+from univoxel.data.load_images import Listed, read_shots
 from univoxel.data.path_sandbox import staying_in
 from univoxel.data.photos import Photos, Truth
 from univoxel.data.transforms import load_cameras
@@ -26,15 +28,21 @@ __all__ = [
     "splits_of",
 ]
 
-# What says that a folder has a layout, for a split; and the photographs of that split, or a
-# DataError. In this order: data sets with splits of their own come first
-_LAYOUTS = (
+
+def _file(*names: str) -> Callable[[Path, str], Path | None]:
+    """Finds the first of some files in a folder."""
+    return lambda folder, _: next((p for name in names if (p := folder / name).is_file()), None)
+
+
+# What a folder of a layout is told by, for a split; and, of what that finds, the photographs of the
+# split, or a DataError. In this order: data sets with splits of their own come first
+_LAYOUTS: tuple[tuple[Callable[[Path, str], Any], Callable[[Path, str, Any], Listed]], ...] = (
     (transforms.is_blender, transforms.list_blender),
-    (transforms.is_nerfstudio, transforms.list_nerfstudio),
+    (_file("transforms.json"), transforms.list_nerfstudio),
     (colmap.models_in, colmap.list_colmap),
-    (research.is_llff, research.list_llff),
-    (research.idr_file, research.list_idr),
-    (research.is_neilf, research.list_neilf),
+    (_file("poses_bounds.npy"), research.list_llff),
+    (_file("cameras_sphere.npz", "cameras.npz", "cameras_large.npz"), research.list_idr),
+    (_file("inputs/sfm_scene.json"), research.list_neilf),
     (photogrammetry.polycam_place, photogrammetry.list_polycam),
     (photogrammetry.metashape_file, photogrammetry.list_metashape),
     (photogrammetry.realitycapture_file, photogrammetry.list_realitycapture),
@@ -69,10 +77,10 @@ def load_photos(
     if not folder.is_dir():
         what = "a file" if folder.exists() else "nothing there"
         raise DataError(f"{folder}: expected a folder with a scene, got {what}")
-    for fits, listed in _LAYOUTS:
-        if fits(folder, split):
+    for find, listed in _LAYOUTS:
+        if found := find(folder, split):
             with looking_in(kept), staying_in(None if allow_outside else folder):
-                return read_shots(folder, split, listed(folder, split), downscale, masks)
+                return read_shots(folder, split, listed(folder, split, found), downscale, masks)
     files = sorted(path.name for path in folder.iterdir())
     raise DataError(
         f"{folder}: expected photographs with their cameras, got "
@@ -87,7 +95,7 @@ def load_photos(
 
 def has_cameras(folder: Path) -> bool:
     """Whether a folder has one of the layouts: photographs whose cameras are known."""
-    return folder.is_dir() and any(fits(folder, "train") for fits, _ in _LAYOUTS)
+    return folder.is_dir() and any(find(folder, "train") for find, _ in _LAYOUTS)
 
 
 def splits_of(folder: Path) -> list[str]:

@@ -1,9 +1,5 @@
 """COLMAP's sparse models.
 
-sparse/0/cameras.bin, images.bin    or .txt; in sparse/0, sparse, colmap/sparse/0 or the folder
-images/<name>                       photographs, or in the folder itself
-masks/<name>.png                    masks, or alpha in the photographs
-
 Source: COLMAP's documentation, "Output Format" and "Camera Models".
 """
 
@@ -17,21 +13,27 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from univoxel.data.conventions import TO_OPENGL, find_photo, listed_split, turned_up
 from univoxel.data.images import image_size, turn_note
 from univoxel.data.lens import FARTHEST, Lens, checked, fitted, is_shrunk
-from univoxel.data.load_images import Listed, Shot
-from univoxel.data.path_sandbox import inside, left_out
+from univoxel.data.load_images import Listed, Shot, listed_split, present, turned_up
+from univoxel.data.path_sandbox import inside
+from univoxel.data.transforms import TO_OPENGL, find_photo, looked_in
 from univoxel.errors import DataError
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
-# By number in binary files; of those that are supported, how many parameters they have.
+# By number in binary files; of those that are supported, their parameters
 MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"),
     *("FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
 )
-SUPPORTED = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
-SUPPORTED |= {"FULL_OPENCV": 12}  # without its denominator, k4 to k6
+SUPPORTED = {
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",  # without its denominator, k4 to k6
+}
 # A feature of a photograph in images.bin: its pixel, and the number of the point that it shows
 SEEN = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 # What reading a broken file may raise; OverflowError: of sizes of hundreds of digits
@@ -47,10 +49,7 @@ class Registered:
     pose: np.ndarray  # [3, 4] camera-to-world, axes as in `Cameras`
 
 
-def list_colmap(folder: Path, split: str) -> Listed:
-    models = models_in(folder, split)
-    if not models:
-        raise DataError(f"{folder}: expected a COLMAP model in {', '.join(PLACES)}, got none")
+def list_colmap(folder: Path, split: str, models: list[tuple[Path, str]]) -> Listed:
     model, ending = models[0]
     cameras_file, images_file = model / f"cameras{ending}", model / f"images{ending}"
     for file in (cameras_file, images_file):
@@ -72,14 +71,15 @@ def list_colmap(folder: Path, split: str) -> Listed:
                 f"{images_file}: expected unique, non-empty image names, got {image.name!r}"
             )
         names.add(image.name)
-    shots, missing, scaled = [], [], 0
-    for image in images:
+    scaled = 0
+
+    def shot(image: Registered) -> Shot | str:
+        nonlocal scaled
         if image.camera not in cameras:
             raise DataError(f"{images_file}: {image.name} refers to missing camera {image.camera}")
         path = find_photo(folder, image.name, str(images_file))
         if path is None:
-            missing.append(image.name)
-            continue
+            return image.name
         lens = cameras[image.camera]
         width, height = image_size(path)
         if is_shrunk(width, height, (lens.width, lens.height)):
@@ -91,9 +91,9 @@ def list_colmap(folder: Path, split: str) -> Listed:
             )
         inner = PurePosixPath(image.name.replace("\\", "/"))
         name = inner.with_suffix("").as_posix().replace("/", "_")
-        shots.append(Shot(name, str(images_file), path, None, image.pose, lens))
-    note = f" (looked in {folder / 'images'} and {folder})"
-    lost = left_out(str(images_file), missing, len(images), note)
+        return Shot(name, str(images_file), path, None, image.pose, lens)
+
+    shots, lost = present(images_file, map(shot, images), looked_in(folder))
     lost += [f"{scaled} cameras scaled to match smaller images"] if scaled else []
     if len(models) > 1:
         lost = [f"{model.relative_to(folder)}, the largest of {len(models)} models", *lost]
@@ -101,29 +101,18 @@ def list_colmap(folder: Path, split: str) -> Listed:
 
 
 def read_cameras(path: Path) -> dict[int, Lens]:
-    """cameras.bin or cameras.txt, by camera id.
-
-    Raises:
-        DataError: a camera model that is not supported.
-        ValueError, IndexError, struct.error: a broken file.
-    """
+    """cameras.bin or cameras.txt, by camera id; a DataError where a camera model is not supported,
+    one of BROKEN where the file is broken."""
     rows = _cameras_text(path) if path.suffix == ".txt" else _cameras_binary(path)
     lenses = {}
     for number, model, width, height, p in rows:
-        match model:
-            case "SIMPLE_PINHOLE":
-                lens = Lens(width, height, (p[0], p[0]), (p[1], p[2]))
-            case "PINHOLE":
-                lens = Lens(width, height, (p[0], p[1]), (p[2], p[3]))
-            case "SIMPLE_RADIAL":
-                lens = Lens(width, height, (p[0], p[0]), (p[1], p[2]), (p[3], 0.0, 0.0))
-            case "RADIAL":
-                lens = Lens(width, height, (p[0], p[0]), (p[1], p[2]), (p[3], p[4], 0.0))
-            case _:
-                if any(p[9:]):
-                    raise _unsupported(path, number, f"{model} with k4, k5 or k6")
-                radial, tangential = (p[4], p[5], p[8] if p[8:] else 0.0), (p[6], p[7])
-                lens = Lens(width, height, (p[0], p[1]), (p[2], p[3]), radial, tangential)
+        if any(p[9:]):
+            raise _unsupported(path, number, f"{model} with k4, k5 or k6")
+        term = dict(zip(SUPPORTED[model].split(), p, strict=True))
+        fx, fy = (term.get(key, p[0]) for key in ("fx", "fy"))
+        radial = tuple(term.get(key, 0.0) for key in ("k1", "k2", "k3"))
+        tangential = term.get("p1", 0.0), term.get("p2", 0.0)
+        lens = Lens(width, height, (fx, fy), (term["cx"], term["cy"]), radial, tangential)
         if min(width, height) <= 0 or not np.isfinite(p).all():
             raise ValueError(f"camera {number}: invalid size {width}x{height} or parameters {p}")
         lenses[number] = checked(lens)
@@ -131,11 +120,7 @@ def read_cameras(path: Path) -> dict[int, Lens]:
 
 
 def read_images(path: Path) -> list[Registered]:
-    """images.bin or images.txt.
-
-    Raises:
-        ValueError, IndexError, struct.error: a broken file.
-    """
+    """images.bin or images.txt; one of BROKEN where the file is broken."""
     if path.suffix == ".txt":
         rows = _images_text(path)
     else:
@@ -187,9 +172,10 @@ def _count(images: Path) -> int:
 
 
 def _parameters(path: Path, number: int, model: str) -> int:
+    """How many numbers a camera has."""
     if model not in SUPPORTED:
         raise _unsupported(path, number, model)
-    return SUPPORTED[model]
+    return len(SUPPORTED[model].split())
 
 
 def _unsupported(path: Path, number: int, model: str) -> DataError:
@@ -236,11 +222,7 @@ def _images_text(path: Path) -> Iterator[tuple[list[float], list[float], int, st
 
 def image_records(data: bytes) -> Iterator[tuple[int, list[float], int, str, np.ndarray]]:
     """Of each photograph in images.bin: number, quaternion and translation to the camera, number of
-    its camera, name, and its features as `SEEN`.
-
-    Raises:
-        ValueError, struct.error: a broken file.
-    """
+    its camera, name, and its features as `SEEN`; one of BROKEN where the file is broken."""
     (count,), at = struct.unpack_from("<Q", data), 8
     for _ in range(count):
         number, *pose, camera = struct.unpack_from("<i7di", data, at)

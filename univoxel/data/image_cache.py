@@ -106,11 +106,8 @@ class Reading:
 
     @staticmethod
     def begun(origin: str, color: Tensor, alpha: Tensor, size: tuple[int, int, int]) -> Reading:
-        """Room for photographs [V, H, W], all stored as this one is.
-
-        Raises:
-            OSError: there is no room on the disk for what is large.
-        """
+        """Room for photographs [V, H, W], all stored as this one is; an OSError where the disk has
+        none for what is large."""
         path, shape = _place.get(), (*size, 3)
         if not origin or path is None or not memmap.is_large(shape, color.dtype):
             return Reading(color.new_zeros(shape), alpha.new_zeros(size))

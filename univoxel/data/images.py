@@ -130,9 +130,6 @@ def write_radiance(path: Path, radiance: np.ndarray) -> None:
     """Write linear RGB [H, W, 3], at least 0, as flat pixels, whole or not at all.
 
     A channel is off by at most 1/256 of the pixel's largest channel, as `read_radiance` reads it.
-
-    Raises:
-        OSError: the file cannot be written; nothing is left behind.
     """
     height, width, _ = radiance.shape
     value = np.minimum(radiance.astype(np.float64), LARGEST_RADIANCE)
@@ -223,9 +220,6 @@ def read_image(path: str | Path, in_srgb: bool = False, infinite: bool = False) 
             kind, or holds NaN or infinity.
     """
     path = Path(path)
-    _refuse_heif(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise DataError(f"{path}: expected an image ({' '.join(SUFFIXES)}), got '{path.suffix}'")
     suffix = kind_of(path)
     if suffix == ".hdr":
         return torch.from_numpy(read_radiance(path))
@@ -248,7 +242,11 @@ def read_image(path: str | Path, in_srgb: bool = False, infinite: bool = False) 
 
 def kind_of(path: Path) -> str:
     """.exr or .hdr where a file is of that kind by its first bytes, otherwise what its name says; a
-    DataError if there is no such file, or it is empty."""
+    DataError if there is no such file, it is empty, or its name is of no picture that is read."""
+    if (suffix := path.suffix.lower()) not in SUFFIXES:
+        hint = ": convert the photographs to JPEG, as `univoxel poses` does" * (suffix in HEIF)
+        expected = f"expected an image ({' '.join(SUFFIXES)}), got '{path.suffix}'"
+        raise DataError(f"{path}: {expected}{hint}")
     _require_file(path)
     with path.open("rb") as file:
         head = file.read(4)
@@ -256,13 +254,9 @@ def kind_of(path: Path) -> str:
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """Width and height of a picture that Pillow or OpenEXR reads, from its beginning only.
-
-    Raises:
-        DataError: the file is missing, empty, or not what its name says.
-    """
+    """Width and height of a picture that Pillow or OpenEXR reads, from its beginning only; a
+    DataError as in `read_image`."""
     path = Path(path)
-    _refuse_heif(path)
     if kind_of(path) != ".exr":
         with opened(path, whole=False) as image:
             return image.size
@@ -422,14 +416,10 @@ def write_exr(
 
 @contextmanager
 def _exr(path: Path, **options: bool) -> Iterator[OpenEXR.File]:
-    """An open OpenEXR file.
+    """An open OpenEXR file; a RuntimeError, ValueError or TypeError where it is damaged.
 
     Of damage the library writes lines to stdout, from Python, and to stderr, from C. Here they
-    become the error, and what other threads print meanwhile is passed on.
-
-    Raises:
-        RuntimeError, ValueError, TypeError: as the library raises them; ValueError too where it
-            only tells.
+    become a ValueError, and what other threads print meanwhile is passed on.
     """
     told = io.StringIO()
     with _OPENING, redirect_stdout(told), _without_stderr():
@@ -461,14 +451,6 @@ def _without_stderr() -> Iterator[None]:
         os.close(nowhere)
 
 
-def _refuse_heif(path: Path) -> None:
-    if path.suffix.lower() in HEIF:
-        raise DataError(
-            f"{path}: expected an image file ({' '.join(SUFFIXES)}), got '{path.suffix}': "
-            "convert the photographs to JPEG, as `univoxel poses` does"
-        )
-
-
 def _require_file(path: Path) -> None:
     """OpenEXR prints to stderr about files that are not there; ask before."""
     if not path.is_file():
@@ -479,11 +461,8 @@ def _require_file(path: Path) -> None:
 
 
 def open_picture(path: Path, formats: Sequence[str]) -> Image.Image:
-    """A file in Pillow's hands, whose own limit of size is too low for photographs.
-
-    Raises:
-        OSError, Image.DecompressionBombError, ValueError, SyntaxError: it is no such picture.
-    """
+    """A file in Pillow's hands, whose own limit of size is too low for photographs; OSError,
+    SyntaxError, ValueError or Image.DecompressionBombError where it is no such picture."""
     with _LIMIT, warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         usual = Image.MAX_IMAGE_PIXELS
@@ -496,11 +475,8 @@ def open_picture(path: Path, formats: Sequence[str]) -> Image.Image:
 
 @contextmanager
 def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
-    """A picture in Pillow's hands, its pixels read where `whole`.
-
-    Raises:
-        DataError: what is wrong with the file, where the block runs into it, too.
-    """
+    """A picture in Pillow's hands, its pixels read where `whole`; a DataError where the file is
+    wrong, also where the block runs into it."""
     kind = KINDS.get(path.suffix.lower(), "a PNG or JPEG")
     _require_file(path)
     try:
@@ -517,11 +493,8 @@ def opened(path: Path, whole: bool = True) -> Iterator[Image.Image]:
 
 
 def as_array(image: Image.Image, path: Path, in_srgb: bool = False) -> np.ndarray:
-    """Pixels [H, W, C] of a picture, as `read_image` has them.
-
-    Raises:
-        DataError: numbers of 32 bits, of which nothing says how bright they are.
-    """
+    """Pixels [H, W, C] of a picture, as `read_image` has them; a DataError of numbers of 32 bits,
+    of which nothing says how bright they are."""
     if image.mode.startswith("I;16"):
         return np.asarray(image, np.float32)[..., None] / 65535
     if image.mode in ("I", "F"):

@@ -85,10 +85,8 @@ def checked(lens: Lens) -> Lens:
 def straightened(lens: Lens) -> Lens:
     """The pinhole with a picture of the same size that sees as much as can be without empty pixels.
 
-    It shares the centre, and its focal lengths have the lens's ratio.
-
-    Raises:
-        ValueError: the distortion folds the picture over, or leaves too little of it.
+    It shares the centre, and its focal lengths have the lens's ratio. A UserError where the
+    distortion folds the picture over, or leaves too little of it.
     """
     if not lens.bent:
         return lens
@@ -173,11 +171,8 @@ def is_shrunk(width: int, height: int, of: tuple[int, int]) -> bool:
 
 
 def fitted(lens: Lens, picture: Path, where: str) -> Lens:
-    """The lens of a picture that may be smaller than those that the lens was found with.
-
-    Raises:
-        DataError: the picture has another shape.
-    """
+    """The lens of a picture that may be smaller than those that the lens was found with; a
+    DataError where it has another shape."""
     w, h = image_size(picture)
     across, down = w / lens.width, h / lens.height
     if abs(across / down - 1) > TALLER + 1 / min(w, h):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -32,7 +32,7 @@ from univoxel.data.masks import (
     require_all,
     require_fit,
 )
-from univoxel.data.path_sandbox import FEWEST, inside
+from univoxel.data.path_sandbox import FEWEST, inside, left_out
 from univoxel.data.photos import Photos, coverage_of, decode
 from univoxel.errors import DataError, UserError, WithoutMasks, some
 
@@ -77,6 +77,17 @@ class Listed:
     kind: str  # of the data set, for people
     shots: Sequence[Shot]
     remarks: Sequence[str] = ()  # on how the files were read, for people
+
+
+def present(
+    where: Path, found: Iterable[Shot | str], looked: str = ""
+) -> tuple[list[Shot], list[str]]:
+    """Photographs that a file or folder lists, but for those that are not there: in their place
+    stands a name. Returns remarks on them, too; arguments and errors as in `left_out`."""
+    found = list(found)
+    shots = [shot for shot in found if isinstance(shot, Shot)]
+    missing = [name for name in found if not isinstance(name, Shot)]
+    return shots, left_out(str(where), missing, len(found), looked)
 
 
 def read_shots(
@@ -522,6 +533,40 @@ def upright(shots: Sequence[Shot]) -> tuple[list[Shot], list[str]]:
         return shots, moved
     turned = in_moved_world(shots, np.column_stack([turn_to_z(up), np.zeros(3)]))
     return turned, [*moved, "world rotated so that +Z is up"]
+
+
+def turned_up(
+    folder: Path,
+    split: str,
+    kind: str,
+    shots: Sequence[Shot],
+    remarks: Sequence[str] = (),
+    chosen: Callable[[Path, Sequence[Shot], str], list[Shot]] = every_eighth,
+) -> Listed:
+    """The `chosen` split of photographs whose world is turned so that +Z is up, where it is not
+    yet.
+
+    The world keeps its scale, and its origin, too, unless that is far away.
+    """
+    shots, moved = upright(shots)
+    return Listed(kind, chosen(folder, shots, split), [*remarks, *moved])
+
+
+def listed_split(folder: Path, shots: Sequence[Shot], split: str) -> list[Shot]:
+    """The split of train_id.txt and test_id.txt, as in Stanford-ORB; without, every eighth."""
+    files = {name: folder / f"{name}_id.txt" for name in ("train", "test")}
+    if split not in files or not all(file.is_file() for file in files.values()):
+        return every_eighth(folder, shots, split)
+    path, by_name = files[split], {shot.image.stem: shot for shot in shots}
+    text = inside(path, str(path)).read_text(encoding="utf-8", errors="replace")
+    lines = text.splitlines()
+    names = [line.strip() for line in lines if line.strip()]
+    found = [by_name[stem] for name in names if (stem := Path(name).stem) in by_name]
+    missing = [name for name in names if Path(name).stem not in by_name]
+    if not names:
+        raise DataError(f"{path}: expected names of photographs, but the file is empty")
+    left_out(str(path), missing, len(names))
+    return found
 
 
 def size_of(image: Tensor) -> str:

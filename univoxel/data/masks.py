@@ -25,6 +25,7 @@ from univoxel.data.images import (
     turn_note,
     upright_from_stored,
 )
+from univoxel.data.path_sandbox import entries
 from univoxel.errors import DataError, some
 
 PLACES = ("masks", "mask", "pmasks")  # folders of masks; the first that has one counts
@@ -62,51 +63,38 @@ Claim = tuple[tuple[int, ...], Path]  # of a mask: how well it fits, lowest best
 
 
 def find_masks(folder: Path, photographs: Named) -> list[Path | None]:
-    """The mask of each photograph of a data set, where it has a folder of masks.
+    """The mask of each photograph of a data set where it has a folder of masks, or None; a
+    DataError where two masks are of one photograph, or one is of two.
 
     Such a folder is called masks, mask or pmasks, or like that of the photographs with _masks or
     _mask behind, upper or lower case. It lies in the folder of the photographs, beside it, or
     beside one around it. Of images_4 it may be masks_4.
-
-    Returns:
-        None for a photograph that has none there.
-
-    Raises:
-        DataError: two masks are of one photograph, or one is of two.
     """
-    found: list[Path | None] = [None] * len(photographs)
+    found: dict[int, Path] = {}
     known = {p: _places(folder, p) for p in {image.parent for _, image in photographs}}
-    waiting = {i: list(known[image.parent]) for i, (_, image) in enumerate(photographs)}
-    while any(waiting.values()):
+    for near in range(max(map(len, known.values()), default=0)):
         asked: dict[Path, list[int]] = {}
-        for i, places in waiting.items():
-            if places:
-                asked.setdefault(places.pop(0), []).append(i)
+        for i, (_, image) in enumerate(photographs):
+            if i not in found and near < len(places := known[image.parent]):
+                asked.setdefault(places[near], []).append(i)
         for place, those in asked.items():
-            masks = _paired(_pictures(place), place, [photographs[i] for i in those])
-            for i, mask in zip(those, masks, strict=True):
-                if mask:
-                    found[i] = mask
-                    del waiting[i]
-    return found
+            found |= _paired(_pictures(place), place, photographs, those)
+    return [found.get(i) for i in range(len(photographs))]
 
 
 def masks_in(folder: Path, photographs: Named) -> list[Path]:
-    """The mask of each photograph in a folder that the user names.
-
-    Raises:
-        DataError: there is no such folder, a photograph has none in it, two masks are of one
-            photograph, or one is of two.
-    """
+    """The mask of each photograph in a folder that the user names; a DataError where there is no
+    such folder, a photograph has none in it or two, or one is of two."""
     if not folder.is_dir():
         what = "a file" if folder.exists() else "nothing there"
         raise DataError(f"{folder}: expected a folder of masks, got {what}")
     files = _pictures(folder)
     if not files:
         raise DataError(f"{folder}: expected masks ({' '.join(SUFFIXES)}), found no image")
-    found = _paired(files, folder, photographs)
-    require_all(folder, photographs, [mask is not None for mask in found])
-    return [mask for mask in found if mask]
+    everyone = range(len(photographs))
+    found = _paired(files, folder, photographs, everyone)
+    require_all(folder, photographs, [i in found for i in everyone])
+    return [found[i] for i in everyone]
 
 
 def require_all(where: Path, photographs: Named, masked: Sequence[bool]) -> None:
@@ -122,18 +110,13 @@ def require_all(where: Path, photographs: Named, masked: Sequence[bool]) -> None
 
 
 def masks_beside(photographs: Named) -> list[Path | None]:
-    """The mask of each photograph that is beside it, such as IMG_1_mask.png.
-
-    Raises:
-        DataError: two masks are of one photograph.
-    """
-    found: list[Path | None] = [None] * len(photographs)
+    """The mask of each photograph that is beside it, such as IMG_1_mask.png; a DataError where two
+    are of one photograph."""
+    found: dict[int, Path] = {}
     for parent in dict.fromkeys(image.parent for _, image in photographs):
         here = [i for i, (_, image) in enumerate(photographs) if image.parent == parent]
-        masks = _paired(_beside(parent), None, [photographs[i] for i in here])
-        for i, mask in zip(here, masks, strict=True):
-            found[i] = mask
-    return found
+        found |= _paired(_beside(parent), None, photographs, here)
+    return [found.get(i) for i in range(len(photographs))]
 
 
 def without_masks(pictures: Sequence[Path]) -> list[Path]:
@@ -169,20 +152,12 @@ def _named_masks(around: Path, inner: str) -> list[Path]:
     if shrunk := re.fullmatch(r"images(_\d+)", inner):
         names += [f"{name}{shrunk[1]}" for name in PLACES]
     order = {folded(name): place for place, name in enumerate([*names, *PLACES])}
-    folders = [p for p in _entries(around) if folded(p.name) in order and p.is_dir()]
+    folders = [p for p in entries(around) if folded(p.name) in order and p.is_dir()]
     return sorted(folders, key=lambda p: (order[folded(p.name)], p.name))
 
 
-def _entries(folder: Path) -> list[Path]:
-    """What is in a folder; nothing where it may not be listed."""
-    try:
-        return sorted(folder.iterdir())
-    except OSError:
-        return []
-
-
 def _beside(folder: Path) -> list[Path]:
-    return [path for path in _entries(folder) if _is_picture(path)]
+    return [path for path in entries(folder) if _is_picture(path)]
 
 
 def _pictures(folder: Path) -> list[Path]:
@@ -195,29 +170,34 @@ def _is_picture(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
 
 
-def _paired(masks: Sequence[Path], root: Path | None, photographs: Named) -> list[Path | None]:
-    """The mask of each photograph among files.
+def _paired(
+    masks: Sequence[Path], root: Path | None, photographs: Named, those: Sequence[int]
+) -> dict[int, Path]:
+    """The masks of some photographs among files, by the photographs' numbers.
 
     Args:
         root: folder of the masks; None: that of the photographs, beside which names must say that
             they are masks.
     """
-    found: list[Path | None] = []
+    found: dict[int, Path] = {}
     whose: dict[Path, Path] = {}
-    for (_, image), claims in zip(photographs, _claims(masks, root, photographs), strict=True):
+    every = _claims(masks, root, [photographs[i] for i in those])
+    for i, claims in zip(those, every, strict=True):
+        image = photographs[i][1]
         best = [mask for rank, mask in claims if rank == min(claims)[0]]
         if len(best) > 1:
             raise DataError(
                 f"{image}: expected one mask, got {' and '.join(map(str, best[:2]))}: remove one"
             )
-        mask = best[0] if best else None
-        if root is not None and mask and whose.setdefault(mask, image) != image:
+        if not best:
+            continue
+        mask = found[i] = best[0]
+        if root is not None and whose.setdefault(mask, image) != image:
             raise DataError(
                 f"{mask}: expected a mask of one photograph, but its name matches {whose[mask]} "
                 f"and {image}: put each mask into a subfolder of the same name as its photograph, "
                 f"or name it after the whole file name, such as {image.name}.png"
             )
-        found.append(mask)
     return found
 
 
@@ -302,14 +282,7 @@ def read_mask(
     """A mask [height, width] of the stored pixels of a photograph, uint8 or float32 in [0, 1].
 
     One of another size but the same shape is resized; rows and columns that an original of N times
-    the size has left over are cut off.
-
-    Args:
-        photograph: of this size, which EXIF may say to turn.
-        upright: as in `laid_over`.
-
-    Raises:
-        DataError: it cannot be read, is none, or has another shape.
+    the size has left over are cut off. Arguments and errors as in `laid_over`.
     """
     mask = laid_over(path, width, height, photograph, upright)
     if mask.shape == (height, width):
@@ -322,16 +295,12 @@ def read_mask(
 def laid_over(
     path: Path, width: int, height: int, photograph: Path | None = None, upright: bool = False
 ) -> Tensor:
-    """A mask as it lies over the stored pixels of a photograph, in its own size.
+    """A mask as it lies over the stored pixels of a photograph of width and height, in its own
+    size; a DataError where it cannot be read, is none, or has another shape.
 
     An orientation in the mask's EXIF counts. A mask without one may have been made of the stored
-    pixels or of the photograph as it is looked at: its size tells, where it is not square.
-
-    Args:
-        upright: what it was made of where its size does not tell.
-
-    Raises:
-        DataError: it cannot be read, is none, or has another shape.
+    pixels or of the photograph as it is looked at: its size tells, where it is not square, and
+    elsewhere `upright`.
     """
     mask, own = coverage_in(path), orientation(path)
     turned = 1 if photograph is None else orientation(photograph)
@@ -364,13 +333,11 @@ def _alike(shape: Sequence[int], width: int, height: int) -> bool:
 
 
 def coverage_in(path: Path) -> Tensor:
-    """A mask as it is stored [H, W]: uint8, or float32 in [0, 1]; largest on the object.
+    """A mask as it is stored [H, W]: uint8, or float32 in [0, 1]; largest on the object. A
+    DataError where it cannot be read, or says nothing of one object.
 
     That is its alpha, unless that is the same all over; or its brightness. Where there are but two
     values, or two colours of which one is black, the larger one is the object, whatever its number.
-
-    Raises:
-        DataError: it cannot be read, or it says nothing of one object.
     """
     if path.suffix.lower() in (".exr", ".hdr"):
         return _levels(read_image(path), path)
@@ -469,15 +436,10 @@ def _scaled(levels: Tensor, path: Path) -> Tensor:
 
 
 def made_upright(pairs: Sequence[tuple[Path, Path]]) -> bool | None:
-    """Whether masks are of photographs as they are looked at, where EXIF says to turn these.
+    """Whether masks are of photographs as they are looked at, where EXIF says to turn these; None
+    if no photograph is turned without its mask.
 
     One whose size tells speaks for all. Without any, colours tell: along a mask's edge they change.
-
-    Args:
-        pairs: photographs and their masks.
-
-    Returns:
-        None if no photograph is turned without its mask.
     """
     asked = [(image, mask) for image, mask in pairs if orientation(image) != 1 == orientation(mask)]
     if not asked:

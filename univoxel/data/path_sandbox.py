@@ -26,14 +26,8 @@ def staying_in(folder: Path | None) -> AbstractContextManager[None]:
 
 
 def inside(path: Path, where: str) -> Path:
-    """The path, if it may be read, once links are followed.
-
-    Args:
-        where: for messages: what says that it is there.
-
-    Raises:
-        DataError: it lies outside of the folder that `staying_in` names.
-    """
+    """The path, if it may be read, once links are followed; a DataError of `where`, which says that
+    it is there, if it lies outside of the folder that `staying_in` names."""
     folder = _folder.get()
     if folder is not None and not path.resolve().is_relative_to(folder):
         raise DataError(
@@ -42,6 +36,14 @@ def inside(path: Path, where: str) -> Path:
             "allow_outside",
         )
     return path
+
+
+def entries(folder: Path) -> list[Path]:
+    """What is in a folder, by name; nothing where it may not be listed."""
+    try:
+        return sorted(folder.iterdir())
+    except OSError:
+        return []
 
 
 # Pictures that a data set lists and does not have: left out, as long as enough remain.
@@ -53,16 +55,12 @@ NAMED = 3  # missing pictures that messages name, at most
 
 
 def left_out(where: str, missing: Sequence[object], listed: int, note: str = "") -> list[str]:
-    """What is to be said of pictures that are not there; a warning in the log says which.
+    """What is to be said of pictures that are missing, by name or path; the log warns of them. A
+    DataError where fewer than FEWEST are there, or than SHARE of those listed.
 
     Args:
         where: what lists them, for messages.
-        missing: their names or paths.
-        listed: pictures, those that are there and those that are not.
         note: where they were looked for, for the error.
-
-    Raises:
-        DataError: fewer than FEWEST of the pictures are there, or than SHARE of them.
     """
     if not missing:
         return []
@@ -103,11 +101,8 @@ def read_npy(path: Path) -> np.ndarray:
 
 
 def read_npz(path: Path, prefix: str = "") -> dict[str, np.ndarray]:
-    """The arrays in a .npz file whose names begin with the prefix.
-
-    Raises:
-        DataError: it cannot be read, or holds something else than numbers.
-    """
+    """The arrays in a .npz file whose names begin with the prefix; a DataError where it cannot be
+    read, or holds something else than numbers."""
     inside(path, str(path))
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:

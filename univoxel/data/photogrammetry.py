@@ -1,4 +1,7 @@
-"""Cameras that photogrammetry programs export: Metashape, RealityCapture, Polycam."""
+"""Cameras that photogrammetry programs export: Metashape, RealityCapture, Polycam.
+
+docs/reference/data-sets.md lists the files of each.
+"""
 
 from __future__ import annotations
 
@@ -9,18 +12,36 @@ import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import starmap
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from univoxel.core.files import read_json
-from univoxel.data.conventions import TO_OPENGL, check_skew, find_photo, parsed, turned_up
 from univoxel.data.images import image_size, turn_note
 from univoxel.data.lens import Lens, fitted
-from univoxel.data.load_images import Listed, Shot, every_eighth, in_moved_world
-from univoxel.data.path_sandbox import inside, left_out
-from univoxel.data.transforms import lens_of, listed_image, pose_of, read_number, short
+from univoxel.data.load_images import (
+    Listed,
+    Shot,
+    every_eighth,
+    in_moved_world,
+    present,
+    turned_up,
+)
+from univoxel.data.path_sandbox import inside
+from univoxel.data.transforms import (
+    TO_OPENGL,
+    check_skew,
+    find_photo,
+    lens_of,
+    listed_image,
+    looked_in,
+    parsed,
+    pose_of,
+    read_number,
+    short,
+)
 from univoxel.errors import DataError
 
 HEAD = 4096  # bytes of a file that say what it is
@@ -46,12 +67,6 @@ def _lens(
 
 # Cameras that Metashape exported, as XML.
 #
-# cameras.xml                 or any other name.xml: chunk with sensors (resolution, calibration: f,
-#                             cx, cy, b1, b2, k1 to k4, p1, p2), components and cameras (label,
-#                             sensor_id, component_id, transform)
-# images/<label>              photographs, or in the folder itself, of any ending
-# masks/<label>.png           masks, also masks/<label>_mask.png, or alpha in the photographs
-#
 # A camera's transform is camera-to-world, axes x right, y down, z forward, in its component or
 # chunk, whose own transform (rotation, translation, scale) leads to the world. cx and cy are
 # counted from the picture's middle. p1 and p2 are those of OpenCV the other way round.
@@ -63,9 +78,8 @@ OFF = ("0", "false", "False")  # as the attribute enabled of a camera
 TERMS = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2", "cx", "cy")
 
 
-def list_metashape(folder: Path, split: str) -> Listed:
+def list_metashape(folder: Path, split: str, path: Path) -> Listed:
     """Of several components the one with most cameras is read."""
-    path = metashape_file(folder, split) or folder / "cameras.xml"
     chunk = _chunk(path)
     sensors = {s.get("id"): s for s in chunk.iterfind("sensors/sensor")}
     every = list(chunk.iterfind("cameras//camera"))
@@ -79,16 +93,15 @@ def list_metashape(folder: Path, split: str) -> Listed:
     groups = {c: g.get("label") for g in chunk.iterfind("cameras/group") for c in g.iter("camera")}
     twice = Counter(c.get("label") for c in chosen)
     lenses: dict[str | None, Lens] = {}
-    shots, missing = [], []
-    for camera in chosen:
+
+    def shot(camera: ET.Element) -> Shot | str:
         label, sensor = camera.get("label") or "", camera.get("sensor_id")
         where = f"{path}: camera {label}"
         group = groups.get(camera) if twice[label] > 1 else None
         listed = f"{group}/{label}" if group else label
         picture = find_photo(folder, listed, where) if label else None
         if picture is None:
-            missing.append(listed)
-            continue
+            return listed
         if sensor not in lenses:
             lenses[sensor] = _sensor_lens(
                 sensors.get(sensor), f"{path}: sensor {sensor} of camera {label}"
@@ -96,14 +109,14 @@ def list_metashape(folder: Path, split: str) -> Listed:
         pose = _camera_pose(camera, world, where)
         lens = fitted(lenses[sensor], picture, where)
         name = f"{group}_{picture.stem}" if group else picture.stem
-        shots.append(Shot(name, where, picture, None, pose, lens))
-    note = f" (looked in {folder / 'images'} and {folder})"
-    lost = left_out(str(path), missing, len(chosen), note)
+        return Shot(name, where, picture, None, pose, lens)
+
+    shots, lost = present(path, map(shot, chosen), looked_in(folder))
     if len(every) > len(chosen):
         told = "not placed, not enabled or in another component"
         if rig := sum(c.get("master_id") is not None for c in every if c not in placed):
             told += f"; {rig} belong to a rig, of which only the master camera has a pose"
-        lost += [f"{len(every) - len(chosen)} of {len(every)} cameras left out: {told}"]
+        lost.append(f"{len(every) - len(chosen)} of {len(every)} cameras left out: {told}")
     return turned_up(folder, split, "Metashape cameras", shots, lost)
 
 
@@ -189,11 +202,6 @@ def _sensor_lens(sensor: ET.Element | None, where: str) -> Lens:
 
 # Cameras that RealityCapture or RealityScan exported as "Internal/External camera parameters".
 #
-# cameras.csv               or any other name.csv, with the columns name, x, y, alt, heading, pitch,
-#                           roll, f, and perhaps px, py, k1 to k4, t1, t2
-# images/<name>             photographs, or in the folder itself
-# masks/<name>.png          masks, or alpha in the photographs
-#
 # x, y, alt is the camera's place in a world with +Z up. Angles are in degrees: with all at 0 a
 # camera looks down, and its picture's top is at +Y; it is turned by -heading about z, pitch about x
 # and roll about y. f is of film 36 mm wide, which is the picture's longer side; px and py are how
@@ -209,21 +217,17 @@ REQUIRED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 OTHER_NAMES = {"yaw": "heading", "f_35mm": "f", "px_norm": "px", "py_norm": "py"}
 
 
-def list_realitycapture(folder: Path, split: str) -> Listed:
-    path = realitycapture_file(folder, split) or folder / "cameras.csv"
-    rows = _rows(path)
-    shots, missing = [], []
-    for line, row in rows:
+def list_realitycapture(folder: Path, split: str, path: Path) -> Listed:
+    def shot(line: int, row: dict[str, str]) -> Shot | str:
         where = f"{path}: line {line}"
         name = PureWindowsPath(row.get("name") or "").name
         picture = find_photo(folder, name, where) if name else None
         if picture is None:
-            missing.append(name or where)
-            continue
+            return name or where
         lens, pose = _row_lens(row, picture, where), _row_pose(row, where)
-        shots.append(Shot(picture.stem, where, picture, None, pose, lens))
-    note = f" (looked in {folder / 'images'} and {folder})"
-    lost = left_out(str(path), missing, len(rows), note)
+        return Shot(picture.stem, where, picture, None, pose, lens)
+
+    shots, lost = present(path, starmap(shot, _rows(path)), looked_in(folder))
     return turned_up(folder, split, "RealityCapture cameras", shots, lost)
 
 
@@ -295,11 +299,6 @@ def _row_pose(row: dict[str, str], where: str) -> np.ndarray:
 
 # Polycam's raw data, as its developer mode exports them.
 #
-# keyframes/corrected_cameras/<time>.json    fx, fy, cx, cy, width, height, and t_00 to t_23:
-#                                            camera-to-world, axes as in ARKit; or keyframes/cameras
-# keyframes/corrected_images/<time>.jpg      photographs; or keyframes/images
-# keyframes/masks/<time>.png                 masks, which Polycam does not make; or masks
-#
 # ARKit's camera axes are x right, y up, z backwards, of the picture as it is stored, and its world
 # has +Y up.
 #
@@ -311,27 +310,25 @@ PLACES = ("keyframes/corrected_", "keyframes/", "corrected_")
 UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0]])  # from +Y up to +Z up
 
 
-def list_polycam(folder: Path, split: str) -> Listed:
+def list_polycam(folder: Path, split: str, place: str) -> Listed:
     """The world keeps its scale, metres, and its origin, and is turned from +Y up to +Z up."""
-    place = polycam_place(folder, split) or PLACES[0]
-    cameras = sorted((folder / f"{place}cameras").glob("*.json"))
-    pictures = folder / f"{place}images"
-    shots, missing = [], []
-    for path in cameras:
+    cameras, pictures = folder / f"{place}cameras", folder / f"{place}images"
+
+    def shot(path: Path) -> Shot | str:
         picture = listed_image(pictures, path.stem, str(path))
         if picture is None:
-            missing.append(path.stem)
-            continue
+            return path.stem
         values = _read(path)
         width, height = (int(values[key]) for key in ("width", "height"))
         lens = fitted(lens_of(values, str(path), width, height), picture, str(path))
         pose = pose_of(values["pose"], str(path))
-        shots.append(Shot(path.stem, str(path), picture, None, pose, lens))
+        return Shot(path.stem, str(path), picture, None, pose, lens)
+
     note = f" (looked in {pictures}"
     others = folder / f"{place.removesuffix('corrected_')}images"
     if others != pictures and others.is_dir():
         note += f"; the images in {others} belong to the cameras in {others.with_name('cameras')}"
-    lost = left_out(str(cameras[0].parent), missing, len(cameras), f"{note})")
+    shots, lost = present(cameras, map(shot, sorted(cameras.glob("*.json"))), f"{note})")
     shots = every_eighth(folder, in_moved_world(shots, UPRIGHT), split)
     return Listed("Polycam raw data", shots, [*lost, "world rotated so that +Z is up (was +Y)"])
 

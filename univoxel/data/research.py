@@ -1,4 +1,7 @@
-"""Layouts of published research data sets: LLFF, IDR, NeILF, TensoIR."""
+"""Layouts of published research data sets: LLFF, IDR, NeILF, TensoIR.
+
+docs/reference/data-sets.md lists the files of each.
+"""
 
 from __future__ import annotations
 
@@ -11,21 +14,23 @@ import numpy as np
 from scipy.linalg import rq
 
 from univoxel.core.files import read_json
-from univoxel.data.conventions import TO_OPENGL, check_skew, listed_split, turned_up
 from univoxel.data.images import image_size, turn_note
 from univoxel.data.lens import Lens, fitted
-from univoxel.data.load_images import Listed, Shot
+from univoxel.data.load_images import Listed, Shot, listed_split, present, turned_up
 from univoxel.data.masks import find_masks, photographs_in
 from univoxel.data.path_sandbox import inside, left_out, read_npy, read_npz
-from univoxel.data.transforms import lens_of, listed_image, pose_of, read_number, short
+from univoxel.data.transforms import (
+    TO_OPENGL,
+    check_skew,
+    lens_of,
+    listed_image,
+    pose_of,
+    read_number,
+    short,
+)
 from univoxel.errors import DataError
 
-# The layout of LLFF, which NeRD publishes its captures in.
-#
-# poses_bounds.npy            [V, 17]: a row for each photograph, in the order of their names
-# images/<name>               photographs, or images_<n>/: shrunk by n
-# view_imgs.txt               names of those that have a row, where some have none
-# masks/<name>.png            masks, where there are any; for images_<n>/ also masks_<n>/
+# LLFF, in which NeRD publishes its captures.
 #
 # A row is camera-to-world [3, 4] with the camera axes down, right and backwards, beside it a column
 # of height, width and focal length, and at the end the nearest and farthest depth, which say
@@ -34,17 +39,11 @@ from univoxel.errors import DataError
 # Source: Mildenhall et al. 2019 (Local Light Field Fusion), "Using your own poses".
 
 
-LLFF_FILE = "poses_bounds.npy"
 COLUMNS = 17  # 3 x 5 for the camera, and two depths
 
 
-def is_llff(folder: Path, split: str) -> bool:
-    return (folder / LLFF_FILE).is_file()
-
-
-def list_llff(folder: Path, split: str) -> Listed:
-    path = folder / LLFF_FILE
-    rows, pictures = _rows(path), _llff_pictures(folder)
+def list_llff(folder: Path, split: str, path: Path) -> Listed:
+    rows, pictures = _rows(path), _llff_pictures(folder, path)
     if len(pictures) != len(rows):
         pictures = _placed(folder, pictures)
     if len(pictures) != len(rows):
@@ -82,7 +81,7 @@ def _rows(path: Path) -> np.ndarray:
     return rows.astype(np.float64)
 
 
-def _llff_pictures(folder: Path) -> list[Path]:
+def _llff_pictures(folder: Path, path: Path) -> list[Path]:
     """The photographs in order of their names, the largest that there are."""
     shrunk = [p for p in folder.glob("images_*") if p.name.removeprefix("images_").isdigit()]
     shrunk.sort(key=lambda p: int(p.name.removeprefix("images_")))
@@ -90,8 +89,7 @@ def _llff_pictures(folder: Path) -> list[Path]:
         if pictures := photographs_in(place):
             return pictures
     raise DataError(
-        f"{folder / LLFF_FILE}: expected images in {folder / 'images'}, images_2, images_4 or "
-        "similar, found none"
+        f"{path}: expected images in {folder / 'images'}, images_2, images_4 or similar, found none"
     )
 
 
@@ -107,28 +105,23 @@ def _llff_lens(size_and_focal: np.ndarray, picture: Path, where: str) -> Lens:
     return fitted(whole, picture, where)
 
 
-# The layout of IDR, NeuS and DTU, and of BlendedMVS as NeuS has it.
+# IDR, NeuS and DTU, and BlendedMVS as NeuS has it.
 #
-# cameras_sphere.npz      world_mat_0, world_mat_1, ..: [4, 4] or [3, 4] from the world to pixels,
-#                         K [R t]; or cameras.npz, cameras_large.npz. scale_mat_i and camera_mat_i
-#                         say nothing here
-# image/000.png           photographs: number i, or the i-th in order of their names
-# mask/000.png            masks: of the same name, number or place
+# world_mat_<i> leads from the world to pixels, K [R t]. Photographs are those of its number, or the
+# i-th in order of their names; masks are of the same name, number or place.
 #
 # Source: Yariv et al. 2020 (IDR) and Wang et al. 2021 (NeuS), the conventions of their data.
 
 
-FILES = ("cameras_sphere.npz", "cameras.npz", "cameras_large.npz")
 PREFIX = "world_mat_"
 KEY = re.compile(r"world_mat_[0-9]{1,9}")
-IMAGES = ("image", "images", "rgb")
-IDR_MASKS = ("mask", "masks")
 
 
-def list_idr(folder: Path, split: str) -> Listed:
+def list_idr(folder: Path, split: str, path: Path) -> Listed:
     """The world is that of world_mat."""
-    path = idr_file(folder, split) or folder / FILES[0]
-    matrices, pictures = _matrices(path), _idr_pictures(folder, path)
+    matrices, pictures = _matrices(path), _first_ordered(folder, "image", "images", "rgb")
+    if not pictures:
+        raise DataError(f"{path}: expected images in {folder / 'image'}, found none")
     numbers = _numbers(path, sorted(matrices), pictures)
     missing = [f"number {number}" for number in sorted(matrices) if number not in numbers]
     lost = left_out(str(path), missing, len(matrices), f" (looked in {pictures[0].parent})")
@@ -136,24 +129,17 @@ def list_idr(folder: Path, split: str) -> Listed:
     for number, picture, mask in zip(numbers, pictures, silhouettes, strict=True):
         where = f"{path}: world_mat_{number}"
         intrinsics, pose = decomposed(matrices[number], where)
-        size = image_size(picture)
         (fx, skew, cx), (_, fy, cy), _ = intrinsics.tolist()
         values = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
-        lens = lens_of(values, where, *size, turn_note(picture))
+        lens = lens_of(values, where, *image_size(picture), turn_note(picture))
         check_skew(skew, lens, where)
         shots.append(Shot(picture.stem, where, picture, mask, pose, lens))
     return turned_up(folder, split, f"IDR layout ({path.name})", shots, lost)
 
 
 def decomposed(matrix: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Intrinsics K [3, 3] and camera-to-world [3, 4] of a projection K [R t].
-
-    Args:
-        matrix: [3, 4], of any scale and sign.
-
-    Returns:
-        K with 1 at its end, and the pose, its axes as in `Cameras`.
-    """
+    """Intrinsics K [3, 3], with 1 at its end, and camera-to-world [3, 4], axes as in `Cameras`, of
+    a projection K [R t] [3, 4] of any scale and sign."""
     matrix = matrix * (1 if np.linalg.det(matrix[:, :3]) > 0 else -1)
     if not np.linalg.cond(matrix[:, :3]) < 1e12:
         raise DataError(f"{where}: expected an invertible projection matrix, got a singular one")
@@ -163,10 +149,6 @@ def decomposed(matrix: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
     position = -np.linalg.solve(matrix[:, :3], matrix[:, 3])
     pose = pose_of(np.column_stack([rotation.T @ TO_OPENGL, position]), where)
     return upper / upper[2, 2], pose
-
-
-def idr_file(folder: Path, split: str) -> Path | None:
-    return next((path for name in FILES if (path := folder / name).is_file()), None)
 
 
 def _matrices(path: Path) -> dict[int, np.ndarray]:
@@ -186,16 +168,10 @@ def _matrices(path: Path) -> dict[int, np.ndarray]:
     return {number: matrix[:3].astype(np.float64) for number, matrix in found.items()}
 
 
-def _idr_pictures(folder: Path, path: Path) -> list[Path]:
-    """Photographs in order of their names, or of their numbers."""
-    for name in IMAGES:
-        if found := photographs_in(folder / name):
-            return _ordered(found)
-    raise DataError(f"{path}: expected images in {folder / IMAGES[0]}, found none")
-
-
-def _ordered(pictures: list[Path]) -> list[Path]:
-    """9.png before 10.png, where names are numbers or differ in one."""
+def _first_ordered(folder: Path, *places: str) -> list[Path]:
+    """The pictures of the first of some folders that has any, in order of their names: 9.png before
+    10.png, where names are numbers or differ in one."""
+    pictures = next((found for name in places if (found := photographs_in(folder / name))), [])
     numbers = _counted(pictures)
     return (
         pictures if numbers is None else [pictures[i] for i in np.argsort(numbers, kind="stable")]
@@ -230,53 +206,40 @@ def _numbers(path: Path, known: list[int], pictures: list[Path]) -> list[int]:
 
 def _masks(folder: Path, pictures: list[Path]) -> Sequence[Path | None]:
     """The masks of photographs: by their places where no name tells."""
-    if any(find_masks(folder, [(path.stem, path) for path in pictures])):
-        return [None] * len(pictures)  # `read_shots` finds them again
-    listed = next((found for name in IDR_MASKS if (found := photographs_in(folder / name))), [])
-    listed = _ordered(listed)
-    return listed if len(listed) == len(pictures) else [None] * len(pictures)
+    listed = _first_ordered(folder, "mask", "masks")
+    named = find_masks(folder, [(path.stem, path) for path in pictures])
+    if any(named) or len(listed) != len(pictures):
+        return [None] * len(pictures)  # `read_shots` finds those that names tell
+    return listed
 
 
-# The layout of NeILF and NeILF++.
-#
-# inputs/sfm_scene.json       image_path.file_paths: names by index; camera_track_map.images: by
-#                             index size [w, h], flg (2: placed), and camera: intrinsic (focal, ppt)
-#                             and extrinsic, 16 numbers from the world to the camera
-# inputs/images/<name>        photographs, under the last part of their names, of any ending
-# inputs/masks/<name>.png     masks, also in inputs/pmasks and masks, or alpha in the photographs
+# NeILF and NeILF++.
 #
 # Source: the public code of Yao et al. 2022 (NeILF), `load_cams_from_sfmscene`.
 
 
-NEILF_FILE = "inputs/sfm_scene.json"
 PLACED = 2  # as flg of an image
 
 
-def is_neilf(folder: Path, split: str) -> bool:
-    return (folder / NEILF_FILE).is_file()
-
-
-def list_neilf(folder: Path, split: str) -> Listed:
-    path = folder / NEILF_FILE
+def list_neilf(folder: Path, split: str, path: Path) -> Listed:
     names, images = _read(path)
-    shots, missing, unplaced = [], [], 0
-    for index, name in names.items():
-        where = f"{path}: image {index}"
-        image = images.get(index)
-        if not isinstance(image, dict) or image.get("flg") != PLACED:
-            unplaced += 1
-            continue
-        picture = listed_image(folder / "inputs" / "images", name, where)
-        if picture is None:
-            missing.append(name)
-            continue
-        lens, pose = _camera(image, where)
-        shots.append(Shot(picture.stem, where, picture, None, pose, fitted(lens, picture, where)))
-    if unplaced == len(names):
+    pictures = folder / "inputs" / "images"
+    known = {index for index, image in images.items() if isinstance(image, dict)}
+    placed = [i for i in names if i in known and images[i].get("flg") == PLACED]
+    if not placed:
         raise DataError(f"{path}: expected images with cameras (flg is {PLACED}), got none")
-    looked = f" (looked in {folder / 'inputs' / 'images'})"
-    lost = left_out(str(path), missing, len(names) - unplaced, looked)
-    lost += [f"{unplaced} photographs left out because they have no camera"] if unplaced else []
+
+    def shot(index: str) -> Shot | str:
+        where = f"{path}: image {index}"
+        picture = listed_image(pictures, names[index], where)
+        if picture is None:
+            return names[index]
+        lens, pose = _camera(images[index], where)
+        return Shot(picture.stem, where, picture, None, pose, fitted(lens, picture, where))
+
+    shots, lost = present(path, map(shot, placed), f" (looked in {pictures})")
+    if unplaced := len(names) - len(placed):
+        lost.append(f"{unplaced} photographs left out because they have no camera")
     return turned_up(folder, split, "NeILF layout", shots, lost)
 
 
@@ -300,14 +263,13 @@ def _read(path: Path) -> tuple[dict[str, str], dict]:
 
 
 def _camera(image: dict, where: str) -> tuple[Lens, np.ndarray]:
-    """Lens and pose of an image."""
+    """Lens and pose of an image, whose extrinsic leads from the world to the camera."""
     try:
         camera = image["camera"]
         focal, centre = camera["intrinsic"]["focal"], camera["intrinsic"]["ppt"]
         values = {"fl_x": focal[0], "fl_y": focal[1], "cx": centre[0], "cy": centre[1]}
         values |= {"w": image["size"][0], "h": image["size"][1]}
-        matrix = camera["extrinsic"]
-        to_camera = np.array(matrix, np.float64).reshape(4, 4)
+        to_camera = np.array(camera["extrinsic"], np.float64).reshape(4, 4)
     except (KeyError, IndexError, TypeError, ValueError, OverflowError) as error:
         raise DataError(
             f"{where}: expected size [w, h] and a camera with focal, ppt and an extrinsic of 16 "
@@ -319,20 +281,22 @@ def _camera(image: dict, where: str) -> tuple[Lens, np.ndarray]:
     return lens_of(values, where, width, height), pose
 
 
-# The layout of TensoIR-Synthetic, and of NeRFactor's scenes.
-#
-# <split>_NNN/metadata.json       imw, imh, cam_angle_x, cam_transform_mat: 16 numbers with commas
-# <split>_NNN/rgba_<light>.png    photograph under a light, straight alpha, sRGB; or rgba.png
+# TensoIR-Synthetic, and NeRFactor's scenes: <split>_NNN/metadata.json beside rgba_<light>.png, a
+# photograph under a light, or rgba.png.
 
 
 LIGHT = "sunset"  # of the photographs that the data set is trained on, where there are several
 
 
+def _views(folder: Path) -> list[Path]:
+    return sorted(path.parent for path in folder.glob("*_[0-9][0-9][0-9]/metadata.json"))
+
+
 def is_tensoir(folder: Path, split: str) -> bool:
-    return any(folder.glob("*_[0-9][0-9][0-9]/metadata.json"))
+    return bool(_views(folder))
 
 
-def list_tensoir(folder: Path, split: str) -> Listed:
+def list_tensoir(folder: Path, split: str, _: object) -> Listed:
     """Photographs under the light of the training views."""
     views = sorted(path.parent for path in folder.glob(f"{split}_*/metadata.json"))
     if not views:
@@ -347,8 +311,7 @@ def list_tensoir(folder: Path, split: str) -> Listed:
 
 def photographed(folder: Path) -> str:
     """Name of the pictures that are trained on: rgba.png, rgba_sunset.png or the only one."""
-    views = sorted(path.parent for path in folder.glob("*_[0-9][0-9][0-9]/metadata.json"))
-    views.sort(key=lambda view: not view.name.startswith("train_"))
+    views = sorted(_views(folder), key=lambda view: not view.name.startswith("train_"))
     first = next((view for view in views if any(view.glob("rgba*.png"))), views[0])
     names = sorted(path.name for path in first.glob("rgba*.png"))
     for name in ("rgba.png", f"rgba_{LIGHT}.png"):
@@ -364,12 +327,10 @@ def photographed(folder: Path) -> str:
 
 def _shot(view: Path, picture: str) -> Shot:
     path = view / "metadata.json"
+    meta = read_json(inside(path, str(path)))
     try:
-        meta = read_json(inside(path, str(path)))
         text = meta["cam_transform_mat"]
         values = [float(value) for value in text.split(",")]
-    except DataError:
-        raise
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(
             f"{path}: expected JSON with cam_transform_mat, numbers separated by commas, but "

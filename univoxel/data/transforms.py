@@ -1,13 +1,15 @@
-"""Cameras in NeRF's JSON: common parts, NeRF-synthetic, nerfstudio, and camera paths without
-images."""
+"""Cameras in NeRF's JSON: NeRF-synthetic, nerfstudio, and camera paths without images; and names,
+numbers and axes as all layouts have them."""
 
 from __future__ import annotations
 
 import math
+import os
 import re
 import reprlib
 from collections.abc import Sequence
 from contextlib import suppress
+from itertools import starmap
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
@@ -19,7 +21,7 @@ from univoxel.core.files import read_json, write_json
 from univoxel.data import load_images
 from univoxel.data.images import FOREIGN, SUFFIXES, image_size, turn_note
 from univoxel.data.lens import FARTHEST, Lens, checked, fitted, is_shrunk
-from univoxel.data.path_sandbox import inside, left_out
+from univoxel.data.path_sandbox import entries, inside
 from univoxel.errors import DataError, UserError
 
 # The JSON of NeRF:
@@ -41,6 +43,8 @@ LOOKED_FOR = f"looked for the endings {', '.join(ending or 'none' for ending in 
 NUMBERS = {"w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x"}
 NUMBERS |= {"k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"}
 WIDEST = 1 << 16  # pixels along a side of pictures to be made: what formats of files hold
+TO_OPENGL = np.diag([1.0, -1.0, -1.0])  # of camera axes: x right, y down, z forward in OpenCV
+SKEW = 0.5  # pixels by which lines may lean and are taken as upright: no mask is as sharp
 OFF = 0.9  # of a picture's sides: no lens is centred so far to the right and below
 MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 
@@ -137,19 +141,22 @@ def read_frames(path: Path) -> tuple[dict[str, Any], list[load_images.Shot], lis
             f"{path}: frame {index}: the name {names[index]} of {frames[index]['file_path']} "
             "occurs twice"
         )
-    shots, missing, scaled = [], [], 0
-    for index, frame in enumerate(frames):
+    scaled = 0
+
+    def shot(index: int, frame: dict[str, Any]) -> load_images.Shot | Path:
+        nonlocal scaled
         where, file_path = f"{path}: frame {index}", frame["file_path"]
         folder = _folder(path, frame, where)
         image = listed_image(folder, file_path, where)
         if image is None:
-            missing.append(folder / file_path)
-            continue
+            return folder / file_path
         lens = _lens(root | frame, where, image)
         scaled += lens.width < (root | frame).get("w", 0)
         pose, mask = pose_of(frame.get("transform_matrix"), where), _mask(path.parent, frame, where)
-        shots.append(load_images.Shot(names[index], where, image, mask, pose, lens))
-    lost = left_out(str(path), missing, len(frames), f" ({LOOKED_FOR}{_smaller(missing)})")
+        return load_images.Shot(names[index], where, image, mask, pose, lens)
+
+    found = list(starmap(shot, enumerate(frames)))
+    shots, lost = load_images.present(path, found, f" ({LOOKED_FOR}{_smaller(found)})")
     first = shots[0].lens
     if "w" not in root | frames[0] and all(
         c > OFF * n for c, n in zip(first.centre, (first.width, first.height), strict=True)
@@ -172,11 +179,12 @@ def _lens(values: dict[str, Any], where: str, image: Path) -> Lens:
     return lens_of(values, where, width, height, turn_note(image))
 
 
-def _smaller(missing: Sequence[Path]) -> str:
+def _smaller(found: Sequence[load_images.Shot | Path]) -> str:
     """A word on folders of shrunk copies of pictures that are missing, such as images_2."""
-    if not missing:
+    missing = next((path for path in found if isinstance(path, Path)), None)
+    if missing is None:
         return ""
-    place = missing[0].parent
+    place = missing.parent
     others = sorted(p.name for p in place.parent.glob(f"{place.name}_*") if p.is_dir())
     if not others:
         return ""
@@ -213,7 +221,8 @@ def listed_image(folder: Path, file_path: str, where: str) -> Path | None:
     names = [file_path + ending for ending in ENDINGS]
     if (named := Path(file_path)).suffix.lower() in (*SUFFIXES, *FOREIGN):
         names += [str(named.with_suffix(ending)) for ending in (*SUFFIXES, *CAPITAL)]
-    found = next((path for name in names if _is_file(path := folder / name)), None)
+    # Of `os`, as it does not raise of names that no file can have
+    found = next((path for name in names if os.path.isfile(path := folder / name)), None)
     found = found or _found_as_written_elsewhere(folder, names, where)
     return None if found is None else inside(found, where)
 
@@ -245,30 +254,27 @@ def _in_any_case(
     """The files of a folder whose path is this, but for capitals and how accents are written.
 
     Args:
-        known: what is in folders, which is added to.
+        known: what is in folders, by its name as in `system.folded`; it is added to.
     """
     found = [folder]
     for part in parts:
-        known |= {f: _entries(f) for f in found if f not in known}
+        for folder in found:
+            if folder not in known:
+                known[folder] = {}
+                for path in entries(folder):
+                    known[folder].setdefault(system.folded(path.name), []).append(path)
         found = [p for f in found for p in known[f].get(system.folded(part), [])]
     return [path for path in found if path.is_file()]
 
 
-def _entries(folder: Path) -> dict[str, list[Path]]:
-    """What is in a folder, by its name as in `system.folded`."""
-    entries: dict[str, list[Path]] = {}
-    with suppress(OSError):
-        for path in sorted(folder.iterdir()):
-            entries.setdefault(system.folded(path.name), []).append(path)
-    return entries
+def find_photo(folder: Path, name: str, where: str) -> Path | None:
+    """A photograph by its name in a list of them: in images/ or in the folder itself."""
+    return listed_image(folder / "images", name, where) or listed_image(folder, name, where)
 
 
-def _is_file(path: Path) -> bool:
-    """Whether there is such a file; names that no file can have are those of none."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
+def looked_in(folder: Path) -> str:
+    """Where `find_photo` looks, as `present` takes it."""
+    return f" (looked in {folder / 'images'} and {folder})"
 
 
 def view_names(file_paths: Sequence[str]) -> list[str]:
@@ -332,21 +338,22 @@ def lens_of(values: dict[str, Any], where: str, width: int, height: int, note: s
         )
     if more := [key for key in ("k4", "k5", "k6") if values.get(key)]:
         raise DataError(f"{where}: expected only distortion terms k1 k2 k3 p1 p2, got {more[0]}")
+
+    def number(key: str, usual: float, low: float = -math.inf, high: float = math.inf) -> float:
+        return read_number(values, key, where, low, high) if key in values else usual
+
     if "fl_x" in values:
-        x = read_number(values, "fl_x", where, 0.0, math.inf)
-        y = read_number(values, "fl_y", where, 0.0, math.inf) if "fl_y" in values else x
+        x = number("fl_x", 0.0, low=0.0)
+        y = number("fl_y", x, low=0.0)
     else:
         angle = read_number(values, "camera_angle_x", where, 0.0, math.pi)
         x = y = 0.5 * width / math.tan(0.5 * angle)
-    bent = {
-        key: read_number(values, key, where, -math.inf, math.inf) if key in values else 0.0
-        for key in ("k1", "k2", "k3", "p1", "p2")
-    }
+    k1, k2, k3, p1, p2 = (number(key, 0.0) for key in ("k1", "k2", "k3", "p1", "p2"))
+    radial, tangential = (k1, k2, k3), (p1, p2)
     centre = (
-        read_number(values, "cx", where, -width, 2 * width) if "cx" in values else width / 2,
-        read_number(values, "cy", where, -height, 2 * height) if "cy" in values else height / 2,
+        number("cx", width / 2, -width, 2 * width),
+        number("cy", height / 2, -height, 2 * height),
     )
-    radial, tangential = (bent["k1"], bent["k2"], bent["k3"]), (bent["p1"], bent["p2"])
     try:
         return checked(Lens(width, height, (x, y), centre, radial, tangential))
     except UserError as error:
@@ -354,11 +361,8 @@ def lens_of(values: dict[str, Any], where: str, width: int, height: int, note: s
 
 
 def read_number(values: dict[str, Any], key: str, where: str, low: float, high: float) -> float:
-    """A number of a frame that lies between two others.
-
-    Raises:
-        DataError: it is missing, no number, or lies elsewhere.
-    """
+    """A number of a frame; a DataError where it is missing, no number, or not between two
+    others."""
     value = values.get(key)
     try:
         if isinstance(value, int | float) and not isinstance(value, bool):
@@ -370,6 +374,32 @@ def read_number(values: dict[str, Any], key: str, where: str, low: float, high: 
     raise DataError(f"{where}: expected {key} between {low:.4g} and {high:.4g}, got {came}")
 
 
+def parsed(text: str | None, what: str, where: str) -> float:
+    """A finite number from text; a DataError where it is missing or another text."""
+    try:
+        value = float(text) if text is not None else math.nan
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        came = "nothing" if text is None else short(text)
+        raise DataError(f"{where}: expected a number for {what}, got {came}")
+    return value
+
+
+def check_skew(skew: float, lens: Lens, where: str) -> None:
+    """Raise where x and y axes of a camera's pixels are not square to one another.
+
+    Args:
+        skew: pixels along x for each focal length along y, as in a matrix of intrinsics.
+    """
+    lean = abs(skew) * lens.height / 2 / lens.focal[1]
+    if not lean <= SKEW:
+        raise DataError(
+            f"{where}: expected perpendicular rows and columns of pixels, got rows shifted by up "
+            f"to {lean:.3g} pixels (skew {skew:.4g})"
+        )
+
+
 def short(value: object) -> str:
     """A value as Python writes it, cut off where it is long."""
     text = _SHORT.repr(value)
@@ -377,11 +407,7 @@ def short(value: object) -> str:
 
 
 def write_cameras(folder: Path, split: str, cameras: Cameras, names: Sequence[str]) -> None:
-    """Write transforms_SPLIT.json for pictures SPLIT/NAME of the cameras.
-
-    Raises:
-        OSError: it cannot be written; what was there before stays.
-    """
+    """Write transforms_SPLIT.json for pictures SPLIT/NAME of the cameras, whole or not at all."""
     frames = []
     for view, pose in enumerate(cameras.camera_to_world.tolist()):
         (x, y), (cx, cy) = cameras.focal[view].tolist(), cameras.centre[view].tolist()
@@ -403,21 +429,15 @@ def _mask(folder: Path, frame: dict[str, Any], where: str) -> Path | None:
     return found
 
 
-# The layout of NeRF-synthetic scenes, of Shiny Blender, Synthetic4Relight and Stanford-ORB.
-#
-# transforms_<split>.json     see univoxel.data.transforms
-# <file_path>[.png]           RGBA photograph, straight alpha, sRGB; or with <file_path>_alpha.png
-# <file_path>_rgba.png        the same
-# <file_path>_rgb.exr         linear photograph, with <file_path>_mask.png
-# train/0001.exr              linear photograph, with train_mask/0001.png
-# transforms_novel.json       views of other scenes, as in Stanford-ORB: split "novel"
+# The layout of NeRF-synthetic scenes, of Shiny Blender, Synthetic4Relight and Stanford-ORB, whose
+# transforms_novel.json is of views of other scenes.
 
 
 def is_blender(folder: Path, split: str) -> bool:
     return any((folder / f"transforms_{s}.json").is_file() for s in ("train", split))
 
 
-def list_blender(folder: Path, split: str) -> load_images.Listed:
+def list_blender(folder: Path, split: str, _: object) -> load_images.Listed:
     path = folder / f"transforms_{split}.json"
     if not path.is_file():
         raise DataError(f"{folder}: {path.name} is missing beside transforms_train.json")
@@ -433,21 +453,10 @@ def list_blender(folder: Path, split: str) -> load_images.Listed:
 
 
 # The layout of nerfstudio and instant-ngp.
-#
-# transforms.json             see univoxel.data.transforms; aabb_scale, scale and offset say nothing
-# images/frame_00001.jpg      photographs, where file_path says
-# masks/frame_00001.png       masks, where mask_path says, or as COLMAP names them
-#
-# train_filenames and test_filenames in the file are its splits, as far as they are there.
 
 
-def is_nerfstudio(folder: Path, split: str) -> bool:
-    return (folder / "transforms.json").is_file()
-
-
-def list_nerfstudio(folder: Path, split: str) -> load_images.Listed:
-    """Where the file has no splits, every eighth is for tests."""
-    path = folder / "transforms.json"
+def list_nerfstudio(folder: Path, split: str, path: Path) -> load_images.Listed:
+    """Where the file has no train_filenames and test_filenames, every eighth is for tests."""
     root, shots, lost = read_frames(path)
     shots, remarks = load_images.upright(shots)
     chosen = root.get(f"{split}_filenames")

@@ -20,23 +20,15 @@ from univoxel.data.research import is_tensoir, photographed
 from univoxel.data.transforms import find_image
 from univoxel.errors import DataError
 
-# What Stanford-ORB has beside its photographs, in the folders above a scene.
+# What Stanford-ORB has beside its photographs, in ../../ground_truth/<scene>.
 #
-# blender_HDR/<scene>/                                    photographs, in the layout of NeRF
-# ground_truth/<scene>/surface_normal/<name>.npy          [H, W, 3], axes of the camera
-# ground_truth/<scene>/z_depth/<name>.npy                 [H, W] along -Z; 0 or less: nothing there
-# ground_truth/<scene>/pseudo_gt_albedo/<name>.png        sRGB
-#
-# Camera axes are x right, y up, z backwards.
-#
-# Source: the public code of Kuang et al. 2023 (Stanford-ORB), README and
-# scripts/preprocess.
+# Source: the public code of Kuang et al. 2023 (Stanford-ORB), README and scripts/preprocess.
 
 
 FILES = {
-    "albedo": "pseudo_gt_albedo/{}.png",
-    "normal": "surface_normal/{}.npy",
-    "depth": "z_depth/{}.npy",
+    "albedo": "pseudo_gt_albedo/{}.png",  # sRGB
+    "normal": "surface_normal/{}.npy",  # [H, W, 3], axes of the camera: x right, y up, z backwards
+    "depth": "z_depth/{}.npy",  # [H, W] along -Z; 0 or less: nothing there
 }
 
 
@@ -82,11 +74,7 @@ _TYPES |= {np.dtype(kind).name: kind for kind in _TYPES.values()}  # int8, uint8
 
 def read_ply(path: Path) -> Mesh:
     """Vertices and faces of a binary little-endian PLY file of triangles; the rest is passed over.
-
-    Raises:
-        DataError: the file is missing, cut off, of another kind, or holds other polygons or
-            places that are not finite.
-    """
+    A DataError where it cannot be read, or holds other polygons or places that are not finite."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -126,15 +114,6 @@ def read_ply(path: Path) -> Mesh:
 
 
 # Ground truth beside the photographs: materials, normals, relit views, points on the surface.
-#
-# test/gt/<name>.npz                                  of this project's scenes
-# test/<name>_albedo.png, _rough.png, _normal.png     Synthetic4Relight, Shiny Blender
-# <name>/albedo.png, normal.png                       TensoIR-Synthetic
-# ../../ground_truth/<scene>/                         Stanford-ORB, see univoxel.data.truth
-# relight/<map>/<name>.png                            test views under envmaps/<map>.hdr
-# test_rli/<map>_<name>.png                           the same in Synthetic4Relight
-# <name>/rgba_<map>.png                               the same in TensoIR-Synthetic
-# points.npz                                          points on the true surface
 
 
 WHOLE = 250 / 255  # coverage above which a pixel is well inside the object
@@ -213,11 +192,7 @@ def load_points(folder: str | Path) -> Tensor | None:
     points = arrays.get("points")
     if points is None or points.ndim != 2 or points.shape[1] != 3 or not len(points):
         raise DataError(f"{path}: expected an array points of shape [P, 3], got {_shapes(arrays)}")
-    with np.errstate(over="ignore"):
-        points = points.astype(np.float32)
-    if not np.isfinite(points).all():
-        raise DataError(f"{path}: points contain NaN or infinity")
-    return torch.from_numpy(points)
+    return _finite(path, "points", points)
 
 
 def map_file(folder: Path, name: str) -> Path | None:
@@ -242,14 +217,19 @@ def _arrays(path: Path, factor: int) -> Truth:
     for key, size in wanted.items():
         if key not in arrays:
             continue
-        with np.errstate(over="ignore"):  # what is infinite then is refused
-            value = arrays[key].astype(np.float32)
-        if value.shape != size:
-            raise DataError(f"{path}: expected {key} of size {list(size)}, got {list(value.shape)}")
-        if not np.isfinite(value).all():
-            raise DataError(f"{path}: expected finite {key}, got NaN or infinity")
-        fields[key] = _shrunk(key, torch.from_numpy(value), alpha, factor)
+        if (shape := arrays[key].shape) != size:
+            raise DataError(f"{path}: expected {key} of size {list(size)}, got {list(shape)}")
+        fields[key] = _shrunk(key, _finite(path, key, arrays[key]), alpha, factor)
     return Truth(**fields)
+
+
+def _finite(path: Path, key: str, array: np.ndarray) -> Tensor:
+    """An array of a file in float32, or a DataError."""
+    with np.errstate(over="ignore"):  # what is infinite then is refused
+        values = array.astype(np.float32)
+    if not np.isfinite(values).all():
+        raise DataError(f"{path}: expected finite {key}, got NaN or infinity")
+    return torch.from_numpy(values)
 
 
 def _pictures(photos: Photos, view: int) -> Truth:

@@ -227,18 +227,13 @@ def with_materials(scene: Scene, mesh: Mesh) -> Mesh:
 def bake(
     scene: Scene, mesh: Mesh, size: int, albedo_near: AlbedoNear | None = None
 ) -> TexturedMesh:
-    """Textures of size x size texels for a mesh near the scene's surface.
+    """Textures of size x size texels for a mesh near the scene's surface; a UserError where no
+    texel lies in a triangle.
 
     Each texel's centre is a point of its triangle; the field at the surface beside it gives normal
-    and materials. So relief that the triangles are too coarse for lies in the texture.
-    Texels outside of the charts copy the nearest inside. Where the mesh is not seen it is smooth,
-    and has no relief.
-
-    Args:
-        albedo_near: what gives the albedo, in place of the field.
-
-    Raises:
-        ValueError: no texel lies in a triangle.
+    and materials, or `albedo_near` the albedo. So relief that the triangles are too coarse for lies
+    in the texture. Texels outside of the charts copy the nearest inside. Where the mesh is not seen
+    it is smooth, and has no relief.
     """
     source, faces, uv = unwrap(mesh, size)
     vertices, normals = mesh.vertices[source], vertex_normals(mesh)[source]

@@ -158,18 +158,11 @@ def require_usd() -> Any:
 
 
 def write_usdz(path: Path, mesh: TexturedMesh, jpeg: int | None = None) -> None:
-    """Write a textured mesh as USDZ, turned to +Y up, whole or not at all.
+    """Write a textured mesh as USDZ, turned to +Y up, whole or not at all; pictures as in `glb`.
 
     One mesh with one UsdPreviewSurface: diffuseColor (sRGB), roughness, metallic where the mesh has
     metal, and normal (raw), each a texture. One unit is one metre. USD holds no tangents: programs
     compute their own.
-
-    Args:
-        jpeg: quality of textures as JPEG, 1 to 95; None: PNG, which loses nothing.
-
-    Raises:
-        MissingExtra: usd-core is not installed.
-        OSError: the file cannot be written; nothing is left behind.
 
     Source: OpenUSD, UsdPreviewSurface and USDZ specifications; Apple's rules for ARKit.
     """
@@ -272,19 +265,13 @@ def _define_material(usd: Any, stage: Any, pictures: dict[str, str]) -> None:
 
 
 def write_obj(path: Path, mesh: TexturedMesh, jpeg: int | None = None) -> None:
-    """Write NAME.obj, NAME.mtl and NAME_{albedo,roughness,normal}.png, each whole or not at all.
+    """Write NAME.obj, NAME.mtl and NAME_{albedo,roughness,normal}.png, or .jpg as in `glb`, each
+    whole or not at all.
 
     A mesh with metal has a NAME_metallic.png besides. Positions stay in the world's axes, +Z up.
-    The .obj comes last: where it is, the others are. Roughness, metallic and normal map are in
-    the widespread extension for physically based materials (Pr, Pm, map_Pr, map_Pm, norm); OBJ has
-    no tangents, programs compute their own.
-
-    Args:
-        jpeg: quality of pictures as .jpg, 1 to 95; None: .png, which loses nothing.
-
-    Raises:
-        OSError: a file cannot be written.
-        ValueError: white space in the name, at which readers of OBJ split.
+    The .obj comes last: where it is, the others are. Roughness, metallic and normal map are in the
+    widespread extension for physically based materials (Pr, Pm, map_Pr, map_Pm, norm); OBJ has no
+    tangents, programs compute their own.
     """
     name = path.stem
     if name.split() != [name]:
@@ -326,9 +313,6 @@ def write_ply(path: Path, mesh: Mesh) -> None:
 
     Per vertex, as far as the mesh has them: x y z, nx ny nz, roughness, metallic and seen (float),
     albedo as red green blue (uchar, sRGB), which is where other programs look for colour.
-
-    Raises:
-        OSError: the file cannot be written; nothing is left behind.
     """
     columns: list[tuple[str, np.ndarray]] = []
 

@@ -82,12 +82,8 @@ class Compared:
 def worst(
     scene: Scene, splits: list[Split], count: int, size: int, albedo_near: AlbedoNear | None = None
 ) -> tuple[list[Compared], int]:
-    """The views that differ most from their photographs, the worst first; how many were compared.
-
-    Args:
-        size: most pixels along the pictures that are returned.
-        albedo_near: what gives the albedo, in place of the field.
-    """
+    """The views that differ most from their photographs, the worst first, with at most `size`
+    pixels along their pictures; how many were compared."""
     views = [(split, view) for split in splits for view in range(len(split.photos))]
     every = -(-len(views) // MOST)
     views = views[::every]
@@ -104,7 +100,7 @@ def worst(
 def compared(
     scene: Scene, split: Split, view: int, size: int, albedo_near: AlbedoNear | None = None
 ) -> Compared:
-    """One view, at most `size` pixels along its longer side; `albedo_near` as in `worst`."""
+    """One view, at most `size` pixels along its longer side."""
     photos = split.photos
     share = min(1.0, size / max(photos.cameras.size(view)))
     cameras = resize(photos.cameras, max(1, round(share * photos.cameras.width)))
@@ -140,13 +136,9 @@ def layers(
     errors: ExpectedErrors | None,
     albedo_near: AlbedoNear | None = None,
 ) -> dict[str, list[Tensor]]:
-    """Pictures [size, size, 3], sRGB, of each of SIDES, by layer: render, albedo, roughness, metal
-    where there is any, normal, and the expected error of the albedo where it is known.
-
-    Args:
-        front: azimuth of the front, degrees from +X.
-        albedo_near: as in `worst`.
-    """
+    """Pictures [size, size, 3], sRGB, of each of SIDES, the front at an azimuth in degrees from +X,
+    by layer: render, albedo, roughness, metal where there is any, normal, and the expected error of
+    the albedo where it is known."""
     cameras = orbit(mesh, len(SIDES), size, ELEVATION, front)
     found: dict[str, list[Tensor]] = {}
     for view in track(range(len(SIDES)), "rendering layers"):

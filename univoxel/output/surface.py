@@ -34,19 +34,11 @@ GOLDEN = 0.6180339887
 
 
 def surface_of(scene: Scene, cameras: Cameras | None = None) -> Mesh:
-    """The surface that a scene's mesh is made of: closed, without crumbs and hollows.
+    """The surface that a scene's mesh is made of: closed, without crumbs and hollows; a NoSurface
+    where there is none, or no part of it encloses volume.
 
-    It is closed where the grid's border cuts it, too. Where no camera sees it, it is smoothed.
-
-    Args:
-        cameras: of the photographs that were trained on, see `cameras_of`; None: nothing is known
-            of what they see, and nothing is smoothed.
-
-    Returns:
-        Geometry, and `seen` where cameras are known.
-
-    Raises:
-        ValueError: there is no surface, or no part of it encloses volume.
+    It is closed where the grid's border cuts it, too. Where none of the cameras that were trained
+    on, see `cameras_of`, sees it, it is smoothed, and `seen` says so; without cameras it is not.
     """
     mesh, *dropped = cleaned(Mesh(*scene.field.isosurface(closed=True)))
     if any(dropped):
@@ -102,14 +94,11 @@ def seen_by(mesh: Mesh, cameras: Cameras, offset: float) -> Tensor:
 
 
 def smoothed(mesh: Mesh, seen: Tensor, reach: float) -> Mesh:
-    """The mesh smooth where it is not seen, with `seen` in [0, 1].
+    """The mesh smooth where it is not seen [P], moved by at most `reach` world units, with `seen`
+    in [0, 1].
 
     Single vertices count as most around them do. What is seen stays where it is; beyond the border
     vertices are free the more the farther they are, within BORDER edges.
-
-    Args:
-        seen: [P] bool.
-        reach: world units that a vertex is moved at most.
     """
     mean = _mean_of_neighbours(mesh)
     share = seen.double().numpy()

@@ -29,12 +29,8 @@ FRAMES_PER_SECOND = 25  # GIF counts in hundredths of a second
 
 
 def require(kind: str) -> None:
-    """Say before the work starts whether this kind can be written.
-
-    Raises:
-        UserError: another kind than gif and mp4.
-        MissingExtra: mp4 without imageio-ffmpeg.
-    """
+    """Say before the work starts whether this kind can be written: a UserError of another kind than
+    gif and mp4, a MissingExtra of mp4 without imageio-ffmpeg."""
     if kind not in ANIMATIONS:
         raise UserError(f"relight: animation must be gif or mp4, got {kind!r}", "animation")
     if kind == "mp4":
@@ -44,12 +40,8 @@ def require(kind: str) -> None:
 def write_animation(path: Path, pictures: Sequence[Path], rate: int = FRAMES_PER_SECOND) -> None:
     """Write pictures, on white where they are transparent, `rate` a second.
 
-    Of differing sizes, they are in the middle of frames that hold the largest. Whole or not at
-    all; a GIF runs in a loop; an MP4 is H.264, cut to even sizes.
-
-    Raises:
-        OSError: a file cannot be read or written.
-        MissingExtra: an MP4 without imageio-ffmpeg.
+    Of differing sizes, they are in the middle of frames that hold the largest. Whole or not at all;
+    a GIF runs in a loop; an MP4, which needs imageio-ffmpeg, is H.264, cut to even sizes.
     """
     sizes = [image_size(picture) for picture in pictures]
     width, height = (max(size[i] for size in sizes) for i in (0, 1))
@@ -150,11 +142,8 @@ class Timelapse:
         write_png(path, labelled(picture, (f"{clock.seconds:.1f} s", *LAYERS[1:])))
 
     def finish(self, scene: Scene, clock: Clock) -> None:
-        """Take the last frame, and make the file of all.
-
-        Raises:
-            OSError: it cannot be written; the frames stay in the run's folder.
-        """
+        """Take the last frame, and make the file of all; where it cannot be written the frames
+        stay."""
         self.take_frame(scene, clock, last=True)
         if self.file is None:
             return

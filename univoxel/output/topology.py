@@ -24,13 +24,11 @@ CRUMB = 0.01  # of the largest component's area: smaller components are dropped
 
 
 def clean(mesh: Mesh) -> Mesh:
-    """Weld coincident vertices, drop degenerate and double faces, crumbs and inner voids.
+    """Weld coincident vertices, drop degenerate and double faces, crumbs and inner voids; a
+    NoSurface where nothing is left.
 
     A component stays if it has at least a hundredth of the largest one's area and encloses volume
     with its faces outwards: what bounds a void inside the object is never seen.
-
-    Raises:
-        ValueError: nothing is left.
     """
     return cleaned(mesh)[0]
 
@@ -69,12 +67,8 @@ def simplify(mesh: Mesh, faces: int) -> Mesh:
 
 
 def close(mesh: Mesh) -> Mesh:
-    """Fill every hole by a fan of triangles around the mean of its border.
-
-    Raises:
-        ValueError: edges of more than two faces, or of faces that disagree about the outside,
-            leave no closed surface.
-    """
+    """Fill every hole by a fan of triangles around the mean of its border; a UserError where edges
+    of more than two faces, or of faces that disagree about the outside, leave no closed surface."""
     vertices, faces = mesh.vertices.double().numpy(), mesh.faces.long().numpy()
     edges = _edges(faces)
     border = edges[~np.isin(_keys(edges), _keys(edges[:, ::-1]))]  # with none the other way round

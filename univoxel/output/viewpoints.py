@@ -58,11 +58,8 @@ def frames_of(names: list[str], lights: Iterable[str], turn: int | None) -> list
 def orbit(
     mesh: Mesh, frames: int, size: int, elevation: float = ELEVATION, start: float = 0.0
 ) -> Cameras:
-    """Cameras on a circle around a mesh that see all of it, counter-clockwise.
-
-    Args:
-        start: azimuth of the first, degrees from +X.
-    """
+    """Cameras on a circle around a mesh that see all of it, counter-clockwise from `start`, degrees
+    from +X."""
     low, high = mesh.vertices.amin(0), mesh.vertices.amax(0)
     middle = (low + high) / 2
     radius = MARGIN * (mesh.vertices - middle).norm(dim=1).max()
@@ -80,11 +77,8 @@ def orbit(
 def views_of(
     run: Path, cameras: str | Path | Cameras, resolution: int | None, elevation: float, mesh: Mesh
 ) -> tuple[list[str], Cameras]:
-    """Names of the views, and their cameras; arguments as in `cli.relight.RelightOptions`.
-
-    Raises:
-        UserError: the cameras cannot be used.
-    """
+    """Names of the views, and their cameras; arguments as in `cli.relight.RelightOptions`, which a
+    UserError refuses."""
     if resolution is not None and resolution < 1:
         raise UserError(f"relight: resolution must be at least 1, got {resolution}", "resolution")
     if isinstance(cameras, Cameras):

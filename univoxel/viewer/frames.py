@@ -64,11 +64,8 @@ class Look:
 
 @torch.no_grad()
 def quick_picture(subject: Subject, cameras: Cameras, look: Look) -> Tensor:
-    """View 0 with few samples, from the mesh only: [H, W, 4] sRGB with straight alpha.
-
-    Raises:
-        UserError: expected errors are asked for, and the photographs are not there.
-    """
+    """View 0 with few samples, from the mesh only: [H, W, 4] sRGB with straight alpha; a UserError
+    of expected errors without photographs."""
     rays = image_rays(cameras, 0)
     surface, wo, hit = surface_along(subject, rays)
     if look.layer == "expected error":  # in the colours of `univoxel eval`
@@ -92,15 +89,12 @@ def quick_picture(subject: Subject, cameras: Cameras, look: Look) -> Tensor:
 def refined_pictures(
     subject: Subject, cameras: Cameras, look: Look, samples: int = MOST_SAMPLES
 ) -> Iterator[Tensor | None]:
-    """View 0 as `univoxel relight` renders it, better with every pass: [H, W, 4] as above.
-
-    Without noise, from the first samples on, where the look asks for that.
+    """View 0 as `univoxel relight` renders it, better with every pass, up to so many samples per
+    pixel: [H, W, 4] as above. Without noise, from the first samples on, where the look asks for
+    that.
 
     Between pictures comes None, after every step of about 0.1 s: a caller who has something more
     urgent to do leaves then.
-
-    Args:
-        samples: of the light per pixel, after which it ends.
     """
     yield quick_picture(subject, cameras, look)
     if look.layer == "expected error":

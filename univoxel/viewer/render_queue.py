@@ -175,12 +175,8 @@ def kind() -> Animation:
 
 
 def turned_about(cameras: Cameras, middle: Tensor, angle: float) -> Cameras:
-    """Cameras carried around a vertical axis, counter-clockwise seen from above.
-
-    Args:
-        middle: [3], a point of the axis.
-        angle: radians.
-    """
+    """Cameras carried around a vertical axis through a point [3], by radians counter-clockwise seen
+    from above."""
     c, s = math.cos(angle), math.sin(angle)
     turn = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     pose = cameras.camera_to_world.clone()
@@ -205,9 +201,6 @@ def film(
     Args:
         frames: of the turn; 0: FRAMES.
         samples: of the light per pixel.
-
-    Raises:
-        OSError: there is no room for the pictures.
     """
     frames = frames or FRAMES
     low, high = subject.bounds

@@ -58,12 +58,8 @@ BOX_COLOR = (255, 160, 60)
 def serving(
     subject: Subject, options: PageOptions | None = None, host: str = HOST, port: int = PORT
 ) -> Iterator[str]:
-    """A block in which a viewer answers; gives its address. Nothing of it is left afterwards.
-
-    Raises:
-        MissingExtra: viser is not installed.
-        UserError: the port is taken, or a map cannot be used.
-    """
+    """A block in which a viewer answers; gives its address. Errors as of `hosted`, and a UserError
+    where a map cannot be used."""
     options = options or PageOptions()
     title = options.title or (subject.run.resolve().name if subject.run else "univoxel")
     options = replace(options, title=title)
@@ -355,11 +351,8 @@ def _bytes(picture: Tensor) -> np.ndarray:
 
 
 def light_of_bytes(name: str, content: bytes) -> Light:
-    """A map that was sent, as file `name` holds it; the light goes by that name.
-
-    Raises:
-        UserError: it cannot be used as a map; the message names it.
-    """
+    """A map that was sent, as file `name` holds it; the light goes by that name, and so does a
+    UserError where it is none."""
     plain = Path(name.replace("\\", "/").replace("\0", "")).name or "map"
     if Path(plain).suffix.lower() not in MAPS:
         raise UserError(f"{plain}: expected an environment map as .hdr or .exr")

@@ -34,12 +34,8 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 @contextlib.contextmanager
 def hosted(host: str, port: int, title: str) -> Iterator[Any]:
-    """A block in which a server answers browsers; gives it. Nothing of it is left afterwards.
-
-    Raises:
-        MissingExtra: viser is not installed.
-        UserError: the port is taken.
-    """
+    """A block in which a server answers browsers; gives it. Nothing of it is left afterwards. A
+    MissingExtra without viser, a UserError where the port is taken."""
     try:
         import viser
     except ImportError:
@@ -132,12 +128,7 @@ BEHIND = 32  # of 255, around the pictures
 
 @contextlib.contextmanager
 def watched(host: str, port: int, title: str) -> Iterator[Spectators]:
-    """A block in which browsers may look at a training.
-
-    Raises:
-        MissingExtra: viser is not installed.
-        UserError: the port is taken.
-    """
+    """A block in which browsers may look at a training; errors as of `hosted`."""
     with hosted(host, port, f"{title}, training") as server:
         # Beside the picture; not every viser has it
         if panel := getattr(server.gui, "main_panel", None):

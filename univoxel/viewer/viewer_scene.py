@@ -48,11 +48,8 @@ class Subject:
 
     @cached_property
     def photos(self) -> Photos:
-        """The photographs that were trained on, where their cameras are believed to be.
-
-        Raises:
-            UserError: they are not there any more.
-        """
+        """The photographs that were trained on, where their cameras are believed to be; a UserError
+        where they are not there any more."""
         if self.run is None:
             raise UserError("view: this needs the photographs of a run, so pass the run's folder")
         return self.scene.registered(photos_of(self.run, split="train"))
@@ -74,11 +71,8 @@ def subject_of(run: Path) -> Subject:
 
 
 def mesh_of(scene: Scene, faces: int = FACES, cameras: Cameras | None = None) -> Mesh:
-    """The surface with at most so many triangles, materials and normals at its vertices.
-
-    Args:
-        cameras: as in `surface_of`.
-    """
+    """The surface, as in `surface_of`, with at most so many triangles, materials and normals at its
+    vertices."""
     return with_materials(scene, simplify(surface_of(scene, cameras), faces))
 
 
