@@ -19,10 +19,10 @@ sys.path.insert(0, str(ROOT / "tests"))
 from layers import LAYERS, violations  # noqa: E402
 
 LIMITS = {
-    "lines of the package": 37_270,
+    "lines of the package": 36_930,
     "lines of the laboratory": 5_300,
     "lines of tests": 37_395,
-    "modules of the package": 163,
+    "modules of the package": 162,
     "loose modules at the top": 12,
     "configuration fields": 126,
     "fields that nothing sets": 0,
@@ -146,12 +146,12 @@ def figures() -> dict[str, int]:
     known, given = fields(), names_set()
     files = [*ROOT.glob("univoxel/**/*.py")]
     return {
-        "lines of the package": 37_270,
+        "lines of the package": lines("univoxel/**/*.py"),
         "lines of the laboratory": lines("lab/*.py", "lab/stress/*.py", "lab/bank/*.py"),
         "lines of tests": lines("tests/**/*.py", "lab/tests/**/*.py"),
-        "modules of the package": 163,
+        "modules of the package": len(files),
         "loose modules at the top": sum(p.parent == ROOT / "univoxel" for p in files) - 1,
-        "configuration fields": 126,
+        "configuration fields": len(known),
         "fields that nothing sets": sum(name not in given for _, name in known),
         "layers": len(LAYERS),
         "imports that go up": len(wrong) - circles,
