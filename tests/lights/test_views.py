@@ -264,31 +264,28 @@ def test_roughness_survives_the_filter():
 
 @pytest.fixture(scope="module")
 def photographs():
-    """The same sphere in a room, and there with a flash too."""
-    flash = Flash(2.0)
-    return {
+    """The same sphere in a room, and there with a flash too: photographs, hull and its grid."""
+    both = {
         name: photographs_under(0.5 * lamps(128), 0.3, VIEWS, flash=lamp)
-        for name, lamp in (("room", None), ("flash", flash))
+        for name, lamp in (("room", None), ("flash", Flash(2.0)))
     }
+    return {name: (photos, *hull_of(photos)) for name, photos in both.items()}
 
 
 def test_photographs_tell_of_a_flash(photographs, caplog):
     caplog.set_level("INFO", "univoxel")
     found = {
-        name: explained_by_flash(observe_hull(photos, *hull_of(photos), 1500))
-        for name, photos in photographs.items()
+        name: explained_by_flash(observe_hull(*seen, 1500)) for name, seen in photographs.items()
     }
     assert found["room"].shade < 0.05
     assert found["flash"].shade > 0.3
     assert found["flash"].ahead > 5
-    photos = photographs["flash"]
-    told = light_frame_of(photos, *hull_of(photos), "auto")
+    told = light_frame_of(*photographs["flash"], "auto")
     assert told.turntable is None
     assert told.flash == pytest.approx(2.0, abs=0.3)
     assert "light: there is a flash on the camera" in caplog.text
-    photos = photographs["room"]
-    assert light_frame_of(photos, *hull_of(photos), "camera").flash is not None
-    assert light_frame_of(photographs["flash"], *hull_of(photos), "world") == LightFrame()
+    assert light_frame_of(*photographs["room"], "camera").flash is not None
+    assert light_frame_of(*photographs["flash"], "world") == LightFrame()
 
 
 @pytest.mark.parametrize(
@@ -309,15 +306,13 @@ def test_what_decides_on_a_flash(photographs, monkeypatch, shade, glint, ahead, 
     if turned:
         around = light_frame.Explained(0.1, 0.4, turned, 0.3)
         monkeypatch.setattr(light_frame, "explained", lambda *_: around)
-    photos = photographs["room"]
-    told = light_frame_of(photos, *hull_of(photos), "auto")
+    told = light_frame_of(*photographs["room"], "auto")
     assert (told.flash is not None) == lit
     assert (told.turntable is not None) == (bool(turned) and not lit)
 
 
 def test_nothing_seen_tells_nothing(photographs):
-    photos = photographs["room"]
-    seen = observe_hull(photos, *hull_of(photos), 100)
+    seen = observe_hull(*photographs["room"], 100)
     black = replace(seen, color=torch.zeros_like(seen.color))
     assert explained_by_flash(black).ahead < 0
 

@@ -23,7 +23,7 @@ from univoxel.training.descent import CHECK, LIMIT, PROOF, WINDOW, Guard, Platea
 def small(data, out):
     stage = plain_stage(voxels=0.008, iterations=24, share=0.5, rays=256)
     stages = (stage, dataclasses.replace(stage, physical_from=0.0))
-    return plain_training(data, out, stages, minutes=2.0, scene=small_scene())
+    return plain_training(data, out, stages, minutes=60.0, scene=small_scene())
 
 
 def events(out):

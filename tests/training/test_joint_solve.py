@@ -376,7 +376,7 @@ JOINT = JointConfig(iterations=20, points=300, newton_points=100, rays=256, trac
 
 def training(data, tmp_path, *stages):
     sizes = small_scene(sky_nodes=32)
-    return plain_training(data, tmp_path / "run", stages, minutes=5.0, scene=sizes)
+    return plain_training(data, tmp_path / "run", stages, minutes=60.0, scene=sizes)
 
 
 def test_a_solve_that_was_killed_goes_on_in_its_round(data, tmp_path, monkeypatch):
