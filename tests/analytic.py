@@ -35,16 +35,27 @@ def look_at(position: torch.Tensor) -> torch.Tensor:
     return torch.stack([right, torch.linalg.cross(back, right), back, position], 1)
 
 
+def cameras_at(places: torch.Tensor, size: int, focal: float) -> Cameras:
+    """Cameras at places [V, 3] that look at the origin, of square pictures."""
+    lens = torch.full((len(places), 2), float(focal)), torch.full((len(places), 2), size / 2)
+    return Cameras(torch.stack([look_at(p) for p in places]), *lens, size, size)
+
+
+def on_circle(views: int, radius: float, height: float) -> torch.Tensor:
+    """Places [V, 3] around +Z, from azimuth 0 on."""
+    angle = 2 * math.pi * torch.arange(views) / views
+    return torch.stack([radius * angle.cos(), radius * angle.sin(), 0 * angle + height], 1)
+
+
 def cameras_around(views: int, size: int = 32, distance: float = 2.0) -> Cameras:
     """Cameras on a spiral around the origin that see a sphere of radius 0.8 whole."""
-    poses = []
+    places = []
     for v in range(views):
         z = 0.9 * (1 - 2 * (v + 0.5) / views)
         phi = v * math.pi * (3 - math.sqrt(5))
         r = math.sqrt(1 - z * z)
-        poses.append(look_at(distance * torch.tensor([r * math.cos(phi), r * math.sin(phi), z])))
-    focal = torch.full((views, 2), size * distance / 2 / 0.9)
-    return Cameras(torch.stack(poses), focal, torch.full((views, 2), size / 2), size, size)
+        places.append([r * math.cos(phi), r * math.sin(phi), z])
+    return cameras_at(distance * torch.tensor(places), size, size * distance / 2 / 0.9)
 
 
 def sphere_normals(cameras: Cameras, view: int) -> tuple[torch.Tensor, torch.Tensor]:

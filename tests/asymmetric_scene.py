@@ -3,6 +3,7 @@
 import math
 
 import torch
+from analytic import cameras_at
 
 from univoxel.camera import Cameras
 from univoxel.color import linear_to_srgb
@@ -13,7 +14,7 @@ from univoxel.fields.grid import fit_grid
 from univoxel.lights import SGConfig
 from univoxel.render.relight import traced_mesh
 from univoxel.scene import Scene, SceneConfig
-from univoxel.sphere import latlong_directions
+from univoxel.sphere import direction_at, latlong_directions
 from univoxel.viewer.viewer_scene import Subject, mesh_of
 
 # Balls of these centres and radii, united.
@@ -72,12 +73,9 @@ def lopsided(voxels: int = 48**3, change=None, light=None) -> Scene:
 
 def looking(azimuth: float, elevation: float, size: int, focal: float) -> Cameras:
     """A camera in the distance that looks at the object; its focal length in widths."""
-    phi, up = math.radians(azimuth), math.radians(elevation)
-    back = torch.tensor([math.cos(up) * math.cos(phi), math.cos(up) * math.sin(phi), math.sin(up)])
-    right = torch.tensor([-math.sin(phi), math.cos(phi), 0.0])
-    position = torch.tensor([0.08, 0.0, 0.08]) + 3.0 * back
-    pose = torch.stack([right, torch.linalg.cross(back, right), back, position], -1)[None]
-    return Cameras(pose, torch.full((1, 2), focal * size), torch.full((1, 2), size / 2), size, size)
+    cameras = cameras_at(3.0 * torch.tensor([direction_at(azimuth, elevation)]), size, focal * size)
+    cameras.camera_to_world[:, :, 3] += torch.tensor([0.08, 0.0, 0.08])
+    return cameras
 
 
 def layers_of(surface: Surface) -> dict[str, torch.Tensor]:

@@ -34,19 +34,3 @@ def shaken(light, seed=0):
     with torch.no_grad():
         light.head[-1].weight.normal_(0, 0.1, generator=g)
     return light
-
-
-def fit(light, surface, wo, target, parameters, steps, lr, turned=True, map_smoothness=0.0):
-    """Minimise the squared error of what is reflected; the last error over the first."""
-    optimizer = torch.optim.Adam(parameters, lr=lr)
-    g = torch.Generator().manual_seed(0) if turned else None
-    errors = []
-    for i in range(steps):
-        optimizer.param_groups[0]["lr"] = lr * 0.1 ** (i / steps)
-        loss = (light.reflected(surface, wo, generator=g) - target).square().mean()
-        optimizer.zero_grad()
-        prior = light.regularisation(surface, surface).map_smoothness
-        (loss if prior is None else loss + map_smoothness * prior).backward()
-        optimizer.step()
-        errors.append(loss.item())
-    return errors[-1] / errors[0]

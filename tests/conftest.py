@@ -7,11 +7,13 @@ import tempfile
 from pathlib import Path
 
 import pytest
+import textured_room
 import torch
 from analytic import write_scene
 from tiny import tiny, tiny_copy  # noqa: F401
 
 from univoxel.data import load_images
+from univoxel.preparation.stereo import depth_maps
 
 # torch.compile has one cache for all processes of a user. It tells neither instruction sets apart,
 # whose kernels give wrong values on another, nor what the arguments of our backward ops are.
@@ -27,6 +29,13 @@ os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(_FOLDER))
 def data(tmp_path_factory):
     """A small data set of the sphere, which no test changes."""
     return write_scene(tmp_path_factory.mktemp("sphere") / "data", views=8, size=24)
+
+
+@pytest.fixture(scope="session")
+def room():
+    """Photographs of an object on a patterned floor, in a room with furniture, and depth maps."""
+    photos = textured_room.photos_of(textured_room.orbit(30, 160, 120))
+    return photos, depth_maps(photos)
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 import math
 
 import torch
+from op_cases import unit
 
 from univoxel.core.records import Mesh
 from univoxel.envmap import EnvMap, tables
@@ -10,11 +11,6 @@ from univoxel.ops import VisibilityScene, relight
 
 WHITE = EnvMap(torch.ones(8, 16, 3))
 DARK = EnvMap(torch.zeros(1, 2, 3))
-
-
-def unit(*shape, seed=0):
-    g = torch.Generator().manual_seed(seed)
-    return torch.nn.functional.normalize(torch.randn(*shape, generator=g), dim=-1)
 
 
 def octahedron(albedo=1.0, roughness=0.5, inside_out=False):
@@ -35,7 +31,7 @@ def octahedron(albedo=1.0, roughness=0.5, inside_out=False):
 
 def sphere_points(n, seed=0, facing=0.2):
     """Points of the unit sphere, which are their own normals, and eyes that look at them."""
-    normal, wo = unit(n, 3, seed=seed), unit(n, 3, seed=seed + 1)
+    normal, wo = unit(n, seed=seed), unit(n, seed=seed + 1)
     return normal, torch.nn.functional.normalize(wo + (1 + facing) * normal, dim=1)
 
 

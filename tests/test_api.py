@@ -45,17 +45,9 @@ def test_a_run_and_what_it_can_do(run, tmp_path, capfd):
     measures = run.evaluate(samples=2)
     assert measures["nvs_psnr"] > 10
     assert capfd.readouterr().out == ""
-
-
-def test_a_run_that_is_there(run):
     again = univoxel.open_run(str(run.path))
     assert repr(again) == f"Run({str(run.path)!r})"
     assert torch.equal(again.mesh().vertices, run.mesh().vertices)
-
-
-def test_a_folder_without_a_run(tmp_path):
-    with pytest.raises(FileNotFoundError, match="not a trained run"):
-        univoxel.open_run(tmp_path)
 
 
 def test_cancelled_and_resumed(data, tmp_path, monkeypatch):
@@ -109,15 +101,14 @@ def test_options_of_the_command_are_arguments(monkeypatch):
         univoxel.train(cfg, preset="draft")
 
 
-def test_what_is_wrong_is_one_line(data, tmp_path):
+def test_what_is_wrong_is_one_line_and_every_public_name_is_there(data, tmp_path):
     with pytest.raises(TypeError, match="out is missing: pass the folder"):
         univoxel.train(data)
     with pytest.raises(DataError, match="expected a folder with a scene"):
         univoxel.train(tmp_path / "nothing", tmp_path / "run")
     with pytest.raises(AttributeError, match="has no attribute 'trian'"):
         univoxel.trian  # noqa: B018
-
-
-def test_every_public_name_is_there():
+    with pytest.raises(FileNotFoundError, match="not a trained run"):
+        univoxel.open_run(tmp_path)
     assert all(getattr(univoxel, name) is not None for name in univoxel.__all__)
     assert set(univoxel.__all__) <= set(dir(univoxel))

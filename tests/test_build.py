@@ -74,17 +74,12 @@ def test_no_variant_flushes_denormals():
     assert (torch.tensor([1e-310], dtype=torch.float64) * 1.0).item() > 0.0
 
 
-def test_version():
-    pyproject = (Path(__file__).parent.parent / "pyproject.toml").read_text()
-    assert f'\nversion = "{univoxel.__version__}"\n' in pyproject
-    changes = (Path(__file__).parent.parent / "CHANGELOG.md").read_text()
-    assert f"## [{univoxel.__version__}]" in changes
-
-
-def test_other_packagings_need_the_same_versions():
+def test_versions_agree():
     """The recipe for conda has the dependencies and the version of pyproject.toml."""
     root = Path(__file__).parent.parent
     pyproject = (root / "pyproject.toml").read_text()
+    assert f'\nversion = "{univoxel.__version__}"\n' in pyproject
+    assert f"## [{univoxel.__version__}]" in (root / "CHANGELOG.md").read_text()
     needed = pyproject.partition("dependencies = [")[2].partition("\n]")[0]
     named = {
         f"{name} >={version}".lower()
@@ -98,12 +93,9 @@ def test_other_packagings_need_the_same_versions():
     assert f'set version = "{univoxel.__version__}"' in recipe
 
 
-def test_import_is_cheap():
+def test_imports_are_cheap():
     loaded = run("import sys, univoxel; print(*sys.modules)").split()
     assert not {"torch", "matplotlib", "scipy", "skimage", "tyro"} & set(loaded)
-
-
-def test_no_extra_is_imported_by_the_ops():
     loaded = run("import sys, univoxel.ops; print(*sys.modules)").split()
     assert not {"matplotlib", "trimesh", "viser", "skimage"} & set(loaded)
 

@@ -17,9 +17,6 @@ def test_known_values():
     srgb = torch.tensor([0.02, 128 / 255, 1.0], dtype=torch.float64)
     linear = color.srgb_to_linear(srgb)
     assert linear.tolist() == pytest.approx([0.02 / 12.92, 0.2158605, 1.0], abs=1e-7)
-
-
-def test_values_outside_are_clipped():
     assert color.linear_to_srgb(torch.tensor([-1.0, 2.0])).tolist() == pytest.approx([0.0, 1.0])
 
 
@@ -44,9 +41,6 @@ def test_the_unclipped_curve_goes_on_above_one():
     color.linear_to_srgb_unclipped(bright).sum().backward()
     assert color.linear_to_srgb_unclipped(bright).item() > 1
     assert bright.grad.item() > 0
-
-
-def test_slope_is_the_derivative_of_the_curve():
     x = torch.tensor([0.0, 0.001, 0.00313, 0.0032, 0.1, 0.9, 3.0], dtype=torch.float64)
     x.requires_grad_()
     (slope,) = torch.autograd.grad(color.linear_to_srgb_unclipped(x[1:]).sum(), x)

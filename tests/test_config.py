@@ -1,14 +1,19 @@
-"""Configurations: presets, their file, and every range that is checked."""
+"""Configurations: presets, their file, every range that is checked, and fields by --set."""
 
 import json
+import math
 import re
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from plain import plain_stage, plain_training
 
 import univoxel
+from univoxel import config as configs
+from univoxel import scene
+from univoxel.capture.config import CaptureConfig
 from univoxel.config import (
     PREPARATION,
     JointConfig,
@@ -19,8 +24,11 @@ from univoxel.config import (
     save_config,
 )
 from univoxel.core.choices import LIGHTS
-from univoxel.errors import UserError
-from univoxel.lights import EnvmapConfig, SGConfig
+from univoxel.core.validation import changed
+from univoxel.errors import ConfigError, UserError
+from univoxel.evaluation.confidence import AdviceConfig
+from univoxel.lights import BakedConfig, EnvmapConfig, EnvmapSGConfig, LightConfig, SGConfig
+from univoxel.lights.base import MOST_DIRECTIONS
 from univoxel.presets import PRESETS, budget, chosen, preset, with_field, with_metal, work_in
 from univoxel.scene import SceneConfig
 from univoxel.training.clock import expected_seconds
@@ -149,15 +157,6 @@ def test_more_minutes_are_more_work():
     assert (fine[-1].voxels, fine[-1].rays) == (fine[-3].voxels, fine[-3].rays)  # memory stays
 
 
-def test_what_preset_and_minutes_choose():
-    photos, run = Path("photos"), Path("run")
-    draft = preset("draft", photos, run, "sg")
-    assert chosen("draft", None, photos, run, "sg") == draft
-    assert chosen("draft", 7.0, photos, run, "sg") == replace(draft, minutes=7.0)  # a limit
-    assert chosen("auto", 7.0, photos, run, "sg") == budget(7.0, photos, run, "sg")
-    assert chosen("auto", None, photos, run) == preset("fast", photos, run)
-
-
 @pytest.mark.parametrize("minutes", [0.0, -1.0, float("nan"), float("inf")])
 def test_no_time_to_work_in(minutes):
     with pytest.raises(ValueError, match=f"minutes must be above 0, got {minutes:g}"):
@@ -180,10 +179,16 @@ def test_an_unknown_light():
         preset("draft", Path("photos"), Path("run"), "candle")
 
 
-def test_presets_differ_in_work():
+def test_what_preset_and_minutes_choose():
     presets = [preset(name, Path("a"), Path("b")) for name in PRESETS]
     seconds = [sum(map(expected_seconds, config.stages)) for config in presets]
     assert seconds == sorted(set(seconds))
+    photos, run = Path("photos"), Path("run")
+    draft = preset("draft", photos, run, "sg")
+    assert chosen("draft", None, photos, run, "sg") == draft
+    assert chosen("draft", 7.0, photos, run, "sg") == replace(draft, minutes=7.0)  # a limit
+    assert chosen("auto", 7.0, photos, run, "sg") == budget(7.0, photos, run, "sg")
+    assert chosen("auto", None, photos, run) == preset("fast", photos, run)
 
 
 def test_the_file_holds_every_field(tmp_path):
@@ -287,3 +292,127 @@ def test_a_file_that_is_no_configuration(tmp_path, text, message):
     with pytest.raises(UserError, match=f"config.json.*{re.escape(message)}|{message}") as caught:
         load_config(path)
     assert str(path) in str(caught.value)
+
+
+NO_SKY = SceneConfig(sky_nodes=0)
+CLASSES = {
+    *(CaptureConfig, AdviceConfig, *get_args(LightConfig)),
+    *(kind for module in (configs, scene) for kind in vars(module).values() if is_dataclass(kind)),
+}
+CONFIGS = {
+    kind.__name__: {StageConfig: STAGE, TrainConfig: CONFIG}.get(kind) or kind()
+    for kind in sorted(CLASSES, key=lambda kind: kind.__name__)
+    if kind.__name__.endswith("Config")
+}
+RANGES = [
+    (name, field.name, said)
+    for name, config in CONFIGS.items()
+    for field in fields(config)
+    if (said := field.metadata["setting"]).range
+]
+
+
+def with_value(name: str, field: str, value: float) -> object:
+    """The class's example with a value there; where there are several, as the last of them."""
+    before = getattr(CONFIGS[name], field)
+    if isinstance(before, tuple):
+        value = (*before[1:], value)
+    return replace(CONFIGS[name], **{field: value})
+
+
+@pytest.mark.parametrize(("name", "field", "said"), RANGES)
+def test_a_number_is_held_to_its_range(name, field, said):
+    low = said.least if said.above is None else said.above
+    below = low - 1 if said.above is None else low
+    for value in (math.nan, math.inf, below, said.most + 0.125):
+        with pytest.raises(
+            ConfigError, match=f"^{name}: {field} must be .*{re.escape(said.range)}"
+        ):
+            with_value(name, field, value)
+    for value in (low if said.above is None else low + 0.125, min(said.most, 1024)):
+        assert said.range not in refusal(name, field, value)  # maybe by a rule of two fields
+
+
+def refusal(name: str, field: str, value: float) -> str:
+    try:
+        with_value(name, field, value)
+    except ConfigError as error:
+        return str(error)
+    return ""
+
+
+def test_every_field_is_explained():
+    for one in CONFIGS.values():
+        assert all(field.metadata["setting"].meaning for field in fields(one))
+    assert len(RANGES) > 80
+
+
+@pytest.mark.parametrize(
+    ("config", "change", "message"),
+    [
+        (STAGE, {"lr_sdf": (0.1,)}, r"lr_sdf must be two numbers above 0, got \(0.1,\)"),
+        (STAGE, {"lr_features": 0.1}, "lr_features must be two numbers above 0, got 0.1"),
+        (STAGE, {"sharpness": (0.5, 0.0)}, "sharpness must be two numbers above 0"),
+        (STAGE, {"field": "octree"}, "field must be dense, sparse or hash, got 'octree'"),
+        (CONFIG, {"data": 42}, "data must be a path, got 42"),
+        (CONFIG, {"out": None}, "out must be a path, got None"),
+        (CONFIG, {"out": Path("run\udcff")}, "out must be a path in UTF-8, got .*run.udcff"),
+        (CONFIG, {"stages": ()}, r"stages must be a tuple whose first stage .*got \(\)"),
+        (CONFIG, {"stages": (JointConfig(),)}, "stages must be a tuple whose first"),
+        (CONFIG, {"stages": (STAGE, JointConfig()), "scene": NO_SKY}, "scene.sky_nodes above 0"),
+        (CONFIG, {"masks": "wide"}, "masks must be auto or given, got 'wide'"),
+        (CONFIG, {"cameras": "wrong"}, "cameras must be auto, given or refined, got 'wrong'"),
+        (CONFIG, {"capacity": "elastic"}, "capacity must be fixed or adaptive, got 'elastic'"),
+        (CONFIG, {"budget_mb": 1.0}, "budget_mb=1 needs capacity=adaptive, got fixed"),
+        (CONFIG, {"light_frame": "moon"}, "light_frame must be auto, world, turntable or camera"),
+        (JointConfig(), {"rays": 3}, "rays must be at least views, got 3"),
+        (SceneConfig(), {"material_channels": 99}, r"at most channels \(16\), got 99"),
+        (SceneConfig(), {"sky_rows": 8193}, r"sky_rows must be in \[0, 8192\], got 8193"),
+        (SceneConfig(), {"roughness": "rough"}, r"roughness must be None or in \(0, 1\]"),
+        (SceneConfig(), {"varying": "all"}, "varying must be none, exposure or light, got 'all'"),
+        *(
+            (kind(), {name: MOST_DIRECTIONS + 1}, rf"{name} must be in \[1, {MOST_DIRECTIONS}\]")
+            for kind in get_args(LightConfig)
+            for name in ("directions", "directions_eval")
+            if kind is not BakedConfig
+        ),
+        *(
+            (kind(), {"rows": 8193}, r"rows must be in \[1, 8192\]")
+            for kind in (EnvmapConfig, EnvmapSGConfig)
+        ),
+    ],
+)
+def test_values_that_no_range_tells_of(config, change, message):
+    with pytest.raises(ConfigError, match=f"^{type(config).__name__}: .*{message}"):
+        replace(config, **change)
+
+
+@pytest.fixture
+def fast() -> TrainConfig:
+    return preset("fast", Path("photos"), Path("run"))
+
+
+def test_fields_by_set(fast):
+    """Of a stage, of a record in one, and one number of several: earlier command lines work."""
+    joint = changed(fast, ["stages.2.newton_steps=2", "stages.2.colors=False"]).stages[2]
+    assert joint == replace(fast.stages[2], newton_steps=2, colors=False)
+    joint = changed(fast, ["stages.2.entropy.teaching_steps=5"]).stages[2]
+    before = fast.stages[2].entropy
+    assert before.teaching_steps != 5
+    assert joint == replace(fast.stages[2], entropy=replace(before, teaching_steps=5))
+    fine = changed(fast, ["stages.1.sharpness.0=0.6"]).stages[1]
+    assert fine.sharpness == (0.6, fast.stages[1].sharpness[1])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("1.sharpness=(0.0, 0.2)", r"sharpness must be two numbers above 0, got \(0.0, 0.2\)"),
+        ("1.sharpness=0.4", "expected a value such as"),
+        ("2.entropy.asked=1", "no field 'asked'; the fields are: teaching_steps"),
+        ("1.sharpness=('soft', 'sharp')", "sharpness must be two numbers above 0"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(fast, change, message):
+    with pytest.raises(ValueError, match=message):
+        changed(fast, [f"stages.{change}"])

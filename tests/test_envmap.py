@@ -76,9 +76,6 @@ def test_density_has_all_of_the_light():
     dark = lookup(envmap, latlong_direction(uv)).sum(1) == 0
     assert 0.1 < dark.float().mean() < 0.5
     assert ((density[row, column] > 0) | dark).all()
-
-
-def test_black_map_is_drawn_uniformly():
     density = tables(EnvMap(torch.zeros(4, 8, 3))).texel[..., 3]
     torch.testing.assert_close(density, torch.full((4, 8), 1 / (4 * math.pi)))
 

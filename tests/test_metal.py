@@ -60,9 +60,6 @@ def test_a_base_colour_is_split_as_gltf_says():
     same, number = brdf.split(BASE, None)
     assert same is BASE
     assert number == 0.04
-
-
-def test_what_no_picture_would_show_is_no_metal():
     assert brdf.metal_or_none(torch.tensor([0.0, 0.49 / 255])) is None
     metallic = torch.tensor([0.0, 0.51 / 255])
     assert brdf.metal_or_none(metallic) is metallic

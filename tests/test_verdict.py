@@ -14,10 +14,12 @@ def of(**changes):
     return judge(dataclasses.replace(CLEAN, **changes))
 
 
-def test_a_good_run():
+def test_a_good_run_and_what_is_no_number():
     found = judge(CLEAN)
     assert (found.word, found.complete, found.empty) == ("good", True, False)
     assert found.sentence() == "Result: good, validation PSNR 31.0 dB"
+    assert of(psnr=float("nan")).word == "retake"
+    assert of(residual=float("nan")).word == "retake"
 
 
 @pytest.mark.parametrize(
@@ -38,11 +40,6 @@ def test_each_piece_of_evidence_counts(name, usable, retake, reason, remedy):
     assert of(**{name: None}).word == "good"
 
 
-def test_what_is_no_number_is_not_good():
-    assert of(psnr=float("nan")).word == "retake"
-    assert of(residual=float("nan")).word == "retake"
-
-
 def test_the_worst_comes_first_and_two_remedies_are_enough():
     found = of(psnr=24.0, residual=0.9, outline=0.05, troubles=2)
     assert found.word == "retake"
@@ -52,7 +49,7 @@ def test_the_worst_comes_first_and_two_remedies_are_enough():
     assert of(troubles=1).reasons == ("training failed once and recovered",)
 
 
-def test_a_run_that_time_cut_is_unfinished():
+def test_a_run_that_was_cut_or_stopped_is_unfinished():
     found = of(steps={"shape": 0.6, "polish": 0.0}, minutes=2.4, limit=1.0, psnr=24.0)
     assert (found.word, found.complete, found.empty) == ("unfinished", False, True)
     assert found.sentence().startswith(
@@ -62,9 +59,6 @@ def test_a_run_that_time_cut_is_unfinished():
     assert not of(steps={"shape": 0.6}).empty
     # Never a limit that was too short
     assert "`--minutes 3`" in of(steps={"shape": 0.9}, minutes=0.5, limit=2.0).remedies[0]
-
-
-def test_a_run_that_was_stopped_is_unfinished():
     found = of(steps={"shape": 0.6}, stopped=True, minutes=2.4, limit=1.0)
     assert "training was stopped" in found.sentence()
     assert found.remedies == ("resume the training with `--resume`",)

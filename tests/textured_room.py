@@ -107,15 +107,12 @@ def _band(
     view: View, samples: int, turn: float, still: bool, first: int, end: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colour [R, W, 3] and mask [R, W] of some rows of pixels: what fits into the cache."""
-    w, h = view.width * samples, view.height * samples
-    scale = view.focal * max(w, h)
-    row, column = np.mgrid[first * samples : end * samples, :w].reshape(2, -1) + 0.5
-    local = np.stack([(column - w / 2) / scale, (h / 2 - row) / scale, -np.ones(len(row))])
-    direction, origin = view.pose[:, :3] @ local, view.pose[:, 3:]
+    origin, direction, local = _rays(view, samples, first, end)
+    count = direction.shape[1]
     c, s = math.cos(turn), math.sin(turn)
     turned = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
     rays = (origin, direction), (turned @ origin, turned @ direction)
-    best, which = np.full(len(row), np.inf), np.full(len(row), -1)
+    best, which = np.full(count, np.inf), np.full(count, -1)
     boxes = [(_box, np.array(low)[:, None], np.array(high)[:, None]) for low, high in BOXES]
     balls = [(_ball, np.array(centre)[:, None], radius) for centre, radius in BALLS]
     for k, (distance, *shape) in enumerate(boxes + balls):
@@ -127,7 +124,7 @@ def _band(
     own = np.isin(which, OBJECT)
     room = which < 0
     if still:  # the pattern stands in the picture
-        points = np.stack([column / scale * 2, row / scale * 2, np.zeros(len(row))])
+        points = 2 * local * np.array([[1.0], [-1.0], [0.0]])
     else:
         best[room] = _inside(origin, direction[:, room])
         points = origin + best * direction
@@ -137,14 +134,18 @@ def _band(
     return color.mean((1, 3)), own.reshape(shape).mean((1, 3))
 
 
+def _rays(view: View, samples: int, first: int, end: int) -> tuple[np.ndarray, ...]:
+    """Origin [3, 1] and directions [3, N] of samples of some rows, and these in the camera."""
+    w, h = view.width * samples, view.height * samples
+    scale = view.focal * max(w, h)
+    row, column = np.mgrid[first * samples : end * samples, :w].reshape(2, -1) + 0.5
+    local = np.stack([(column - w / 2) / scale, (h / 2 - row) / scale, -np.ones(len(row))])
+    return view.pose[:, 3:], view.pose[:, :3] @ local, local
+
+
 def distance(view: View) -> np.ndarray:
     """Along each pixel's ray to what it shows: [H, W] float32."""
-    row, column = np.mgrid[: view.height, : view.width].reshape(2, -1) + 0.5
-    scale = view.focal * max(view.width, view.height)
-    local = np.stack(
-        [(column - view.width / 2) / scale, (view.height / 2 - row) / scale, -np.ones(len(row))]
-    )
-    direction, origin = view.pose[:, :3] @ local, view.pose[:, 3:]
+    origin, direction, _ = _rays(view, 1, 0, view.height)
     boxes = [_box(*(np.array(x)[:, None] for x in box), origin, direction) for box in BOXES]
     balls = [_ball(np.array(c)[:, None], r, origin, direction) for c, r in BALLS]
     near = np.minimum.reduce([*boxes, *balls, _inside(origin, direction)])

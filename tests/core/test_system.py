@@ -1,4 +1,4 @@
-"""What other systems do in another way, with stand-ins for what they alone have."""
+"""What systems do in different ways, and what a machine says of itself, with stand-ins for both."""
 
 import ctypes
 import os
@@ -15,7 +15,7 @@ from unittest.mock import Mock
 import psutil
 import pytest
 
-from univoxel.core import system
+from univoxel.core import machine, system
 from univoxel.data.load_images import check_name
 from univoxel.data.transforms import view_names
 from univoxel.errors import DataError
@@ -127,14 +127,16 @@ def test_names_that_are_one_file(each):
     assert system.file_key("a") != system.file_key("b")
 
 
-@pytest.mark.parametrize("name", ["a:b", "what?", "con", "NUL.png", "com1", "end.", "end ", "a\nb"])
-def test_names_that_windows_gives_no_file(name, each):
-    assert system.can_be_a_name(name) == (each != "win32")
-
-
-@pytest.mark.parametrize("name", ["r_0.5", "console", "IMG 1", "nul_2", ".hidden", "\u00fc"])
-def test_names_that_every_system_has(name, each):
-    assert system.can_be_a_name(name)
+@pytest.mark.parametrize(
+    ("names", "of_windows"),
+    [
+        (("a:b", "what?", "con", "NUL.png", "com1", "end.", "end ", "a\nb"), False),
+        (("r_0.5", "console", "IMG 1", "nul_2", ".hidden", "\u00fc"), True),
+    ],
+)
+def test_names_that_a_system_gives_a_file(names, of_windows, each):
+    for name in names:
+        assert system.can_be_a_name(name) == (of_windows or each != "win32"), name
 
 
 def test_views_whose_pictures_would_be_one_file(monkeypatch):
@@ -148,15 +150,12 @@ def test_views_whose_pictures_would_be_one_file(monkeypatch):
         check_name("aux", "here")
 
 
-def test_what_ended_a_process():
+def test_what_ended_a_process_and_what_control_c_does_not_reach(each):
     assert system.ended_by(0) is None
     assert system.ended_by(2) is None
     assert system.ended_by(-9) == "SIGKILL"
     assert system.ended_by(0xC0000017) == "a lack of memory"
     assert system.ended_by(0xC0000409) == "fault 0xc0000409"
-
-
-def test_a_process_that_control_c_does_not_reach(each):
     options = system.own_session()
     assert options == ({"creationflags": 512} if each == "win32" else {"start_new_session": True})
 
@@ -261,3 +260,113 @@ def test_no_other_file_asks_which_system_it_is():
         for path in package.rglob("*.py")
     }
     assert [path for path, words in found.items() if words] == [str(Path("core/system.py"))]
+
+
+GIB = 1 << 30
+
+
+def machine_with(tmp_path: Path, groups: str, files: dict[str, str]) -> Path:
+    """A root with 16 GiB of memory, 12 of them free, and these control groups."""
+    memory = f"MemTotal: {16 << 20} kB\nMemFree: 1 kB\nMemAvailable: {12 << 20} kB\n"
+    known = {"proc/meminfo": memory, "proc/self/cgroup": groups} | files
+    for name, text in known.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return tmp_path
+
+
+def test_memory_of_this_machine():
+    found = machine.memory()
+    assert found is not None
+    assert found.total > GIB
+    assert found.free is None or 0 < found.free <= found.total
+
+
+@pytest.mark.parametrize(
+    ("groups", "files", "total", "free"),
+    [
+        ("", {}, 16, 12),
+        ("0::/a/b\n", {"a/b/memory.max": "max\n", "a/b/memory.current": f"{GIB}\n"}, 16, 12),
+        # The limit may be of a group around it; pages of files do not count as used
+        (
+            "0::/a/b\n",
+            {
+                "a/memory.max": f"{4 * GIB}\n",
+                "a/memory.current": f"{3 * GIB}\n",
+                "a/memory.stat": f"anon {GIB}\ninactive_file {2 * GIB}\n",
+            },
+            4,
+            3,
+        ),
+        # Of two limits the tighter one counts, for what is left as well
+        (
+            "0::/a/b\n",
+            {
+                "a/memory.max": f"{8 * GIB}\n",
+                "a/memory.current": f"{7 * GIB}\n",
+                "a/b/memory.max": f"{4 * GIB}\n",
+                "a/b/memory.current": f"{GIB}\n",
+            },
+            4,
+            1,
+        ),
+        # In a container the path is one of the host: the mounted root is the group
+        ("0::/../host\n", {"memory.max": f"{2 * GIB}\n", "memory.current": f"{GIB}\n"}, 2, 1),
+        (
+            "5:cpu,cpuacct:/x\n4:memory:/docker/1\n",
+            {
+                "memory/memory.limit_in_bytes": f"{2 * GIB}\n",
+                "memory/memory.usage_in_bytes": f"{GIB}\n",
+            },
+            2,
+            1,
+        ),
+        # What the first version writes where there is no limit
+        (
+            "4:memory:/\n",
+            {
+                "memory/memory.limit_in_bytes": "9223372036854771712\n",
+                "memory/memory.usage_in_bytes": f"{GIB}\n",
+            },
+            16,
+            12,
+        ),
+    ],
+)
+def test_memory_within_control_groups(tmp_path, groups, files, total, free):
+    root = machine_with(tmp_path, groups, {f"sys/fs/cgroup/{name}": t for name, t in files.items()})
+    assert machine.memory(root) == machine.Memory(total * GIB, free * GIB)
+
+
+@pytest.mark.parametrize(
+    ("groups", "files", "granted"),
+    [
+        ("0::/\n", {"cpu.max": "max 100000\n"}, None),
+        ("0::/a\n", {"a/cpu.max": "50000 100000\n"}, 0.5),
+        ("0::/a\n", {"cpu.max": "25000 100000\n"}, 0.25),
+        ("3:cpu,cpuacct:/\n", {"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "1"}, None),
+        (
+            "3:cpu,cpuacct:/\n",
+            {"cpu/cpu.cfs_quota_us": "20000\n", "cpu/cpu.cfs_period_us": "100000\n"},
+            0.2,
+        ),
+    ],
+)
+def test_cores_within_control_groups(tmp_path, groups, files, granted):
+    root = machine_with(tmp_path, groups, {f"sys/fs/cgroup/{name}": t for name, t in files.items()})
+    everything = len(os.sched_getaffinity(0))
+    assert machine.cores(root) == (everything if granted is None else granted)
+
+
+def test_the_processor_has_a_name_and_memory_is_known_without_such_files(tmp_path):
+    root = machine_with(
+        tmp_path, "", {"proc/cpuinfo": "processor\t: 0\nmodel name\t: Abacus 3000\n"}
+    )
+    assert machine.processor(root) == "Abacus 3000"
+    assert machine.processor(tmp_path / "nothing")
+    # As psutil has it, on macOS and Windows.
+    found = machine.memory(tmp_path)
+    assert found is not None
+    assert found.free is not None
+    assert GIB / 4 < found.free <= found.total

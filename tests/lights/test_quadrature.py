@@ -111,13 +111,10 @@ def test_an_occlusion_brings_its_directions():
     torch.testing.assert_close(got, expected, rtol=0, atol=0.02)
 
 
-def test_a_generator_turns_each_point():
+def test_a_generator_turns_each_point_or_the_shared_set_as_a_whole():
     turns = quadrature.rotations(ball(50), torch.Generator().manual_seed(0))
     assert float(turns.std()) > 1
     assert float(quadrature.rotations(ball(50), None).abs().max()) == 0
-
-
-def test_the_shared_set_is_turned_as_a_whole():
     still = quadrature.whole_sphere(64, None)
     turned = quadrature.whole_sphere(64, torch.Generator().manual_seed(0))
     torch.testing.assert_close(turned @ turned.T, still @ still.T, atol=1e-5, rtol=0)

@@ -8,15 +8,50 @@ import math
 
 import pytest
 import torch
-from extremes import REACH, WILD, channels, few, pick, same, seeds
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from op_cases import CASES, LEAVES, doubled, flat, fresh, function
 
 from univoxel import ops
-from univoxel.ops import native
+from univoxel.core.records import Mesh
+from univoxel.envmap import EnvMap, tables
+from univoxel.ops import PointLight, Sun, VisibilityScene, native, relight
+
+few = settings(max_examples=40, deadline=None, derandomize=True)
+
+REACH = 1e36  # of a float32 result: sums of some tens of these stay below 3.4e38
+WILD = (0.0, -0.0, 1e-45, -1e-40, 1.2e-38, 1e-7, 0.5, 1.0, -1.0, 1e4, 1e30, -1e30)
+seeds = st.integers(0, 2**31)
+channels = st.sampled_from([0, 1, 3, 12, 17])
+
+
+def pick(generator, values, *size):
+    """Numbers drawn from a list, and as many from a normal distribution."""
+    values = torch.tensor(values, dtype=torch.float64)
+    drawn = values[torch.randint(len(values), size, generator=generator)]
+    usual = torch.randn(size, generator=generator, dtype=torch.float64)
+    return torch.where(torch.rand(size, generator=generator) < 0.5, drawn, usual).float()
+
+
+def same(a, b):
+    """Equal numbers, NaN equal to NaN."""
+    return torch.equal(torch.nan_to_num(a, 12345.0), torch.nan_to_num(b, 12345.0)) and torch.equal(
+        a.isnan(), b.isnan()
+    )
+
+
+def unit_or_pole(generator, *shape):
+    """[..., 3]: directions, poles, and what has no length or almost none."""
+    odd = torch.tensor([[0.0, 0, 1], [0, 0, -1], [0, -0.0, -0.0], [1, 0, 0], [1e-20, 0, 0]])
+    usual = torch.nn.functional.normalize(torch.randn(*shape, 3, generator=generator), dim=-1)
+    chosen = odd[torch.randint(len(odd), shape, generator=generator)]
+    return torch.where(torch.rand(*shape, 1, generator=generator) < 0.4, chosen, usual)
+
 
 pytestmark = pytest.mark.skipif(native.core is None, reason="without the extension")
+RAYS = pytest.mark.skipif(
+    native.core is None or not native.core.embree_version(), reason="built without Embree"
+)
 
 
 # Numbers on and beyond the edges of what an argument may hold; others take any
@@ -51,7 +86,7 @@ def wild(case, n, seed):
 
     for name, value in arguments.items():
         if name in ("axis", "normal", "wo"):
-            arguments[name] = unit_or_pole(g, value)
+            arguments[name] = unit_or_pole(g, *value.shape[:-1])
         elif name in known and isinstance(value, list):
             arguments[name] = [drawn(name, t) for t in value]
         elif name in known and isinstance(value, torch.Tensor):
@@ -61,13 +96,6 @@ def wild(case, n, seed):
         along = n * torch.tensor([1.0, -1.0])[torch.randint(2, (len(n), 1), generator=g)]
         arguments["wo"] = torch.where(torch.rand(len(n), 1, generator=g) < 0.3, along, wo)
     return arguments
-
-
-def unit_or_pole(g, like):
-    poles = torch.tensor([[0.0, 0, 1], [0, 0, -1], [0, -0.0, -0.0], [1, 0, 0], [1e-20, 0, 1]])
-    v = torch.nn.functional.normalize(torch.randn(like.shape, generator=g), dim=-1)
-    chosen = poles[torch.randint(len(poles), like.shape[:-1], generator=g)]
-    return torch.where(torch.rand(*like.shape[:-1], 1, generator=g) < 0.4, chosen, v)
 
 
 def everything(case, arguments):
@@ -265,9 +293,7 @@ def test_adam_rows_keeps_nan_in_its_row(seed, n, n_channels, eps):
 # --- visibility
 
 
-@pytest.mark.skipif(
-    native.core is None or not native.core.embree_version(), reason="built without Embree"
-)
+@RAYS
 @few
 @given(seeds, st.integers(0, 40))
 def test_rays_at_the_edge_meet_what_they_should(seed, n):
@@ -285,3 +311,88 @@ def test_rays_at_the_edge_meet_what_they_should(seed, n):
     assert hit.face[n] == 0
     # Rounding: where there is no AVX-512, Embree divides by a refined estimate
     torch.testing.assert_close(hit.t[n], torch.tensor(1.0))
+
+
+EDGES = (0.0, -0.0, 1e-45, 1.0)  # of what lies in [0, 1]
+heights = st.sampled_from([1, 2, 5, 40])  # of a map; 40: rows of several blocks, the last not full
+
+
+def wild_map(g, height):
+    radiance = pick(g, (0.0, 1e-45, 1e-30, 1.0, 1e6, 1e20), height, 2 * height, 3).abs()
+    dark = torch.rand(height, 2 * height, 1, generator=g) < 0.5
+    return tables(
+        EnvMap(radiance.masked_fill(dark, 0.0), rotation=float(pick(g, (-1e4, 359.0), 1)))
+    )
+
+
+def points(g, n, height, faces=6):
+    """Keyword arguments of `relight`: n points, a mesh of loose triangles and a map, all wild."""
+    corners = pick(g, (0.0, 1e-20, 1.0, 1e4), 3 * faces, 3)
+    mesh = Mesh(
+        corners,
+        torch.arange(3 * faces, dtype=torch.int32).reshape(-1, 3),
+        unit_or_pole(g, 3 * faces),
+        pick(g, EDGES, 3 * faces, 3).clamp(0, 1),
+        pick(g, EDGES, 3 * faces).clamp(0, 1),
+    )
+    return {
+        "scene": VisibilityScene(mesh.vertices, mesh.faces),
+        "mesh": mesh,
+        "tables": wild_map(g, height),
+        "position": pick(g, (0.0, 1e-20, 1.0, 1e4, 1e17), n, 3),
+        "normal": unit_or_pole(g, n),
+        "wo": unit_or_pole(g, n),
+        "albedo": pick(g, EDGES, n, 3).clamp(0, 1),
+        "roughness": pick(g, EDGES, n).clamp(0, 1),
+        "f0": pick(g, EDGES, n, 3).clamp(0, 1),
+        "mesh_f0": pick(g, EDGES, 3 * faces, 3).clamp(0, 1),
+        "offset": 1e-3,
+        "samples": 5,
+        "bounces": 2,
+        "suns": (Sun((0.3, 0, 1), (1e6, 1, 0)), Sun((0, 0, -1), (1, 1, 1), 179.0)),
+        "point_lights": (
+            PointLight((0, 0, 0), (1, 1e-30, 1)),
+            PointLight((0, 0, 1e4), (1e6, 1, 1)),
+        ),
+    }
+
+
+@RAYS
+@few
+@given(seeds, st.integers(0, 40), heights, st.sampled_from(["mis", "map", "brdf"]))
+def test_light_is_finite_and_not_negative(seed, n, height, strategy):
+    given = points(torch.Generator().manual_seed(seed), n, height)
+    rgb = relight(**given, strategy=strategy)
+    assert rgb.isfinite().all()
+    assert rgb.ge(0).all()
+    dead = given["normal"].square().sum(1) < 0.5
+    assert rgb[dead].eq(0).all()
+
+
+@RAYS
+@few
+@given(
+    seeds,
+    st.integers(0, 19),
+    st.sampled_from(["position", "normal", "wo", "albedo", "roughness", "f0"]),
+    st.sampled_from([math.nan, math.inf, -math.inf]),
+)
+def test_what_is_not_finite_stays_at_its_point(seed, point, name, value):
+    given = points(torch.Generator().manual_seed(seed), 20, 5) | {"bounces": 0}
+    before = relight(**given)
+    broken = given[name].clone()
+    broken[point] = value
+    after = relight(**(given | {name: broken}))
+    others = torch.arange(20) != point
+    # Its neighbours move up one place in the vectors that they are computed in: other rounding.
+    torch.testing.assert_close(after[others], before[others], rtol=1e-4, atol=0)
+    assert after[point].eq(0).all()
+
+
+@RAYS
+@few
+@given(seeds, st.integers(0, 3))
+def test_without_triangles_there_is_nothing_to_bounce_off(seed, bounces):
+    given = points(torch.Generator().manual_seed(seed), 9, 2, faces=0)
+    direct, bounced = (relight(**(given | {"bounces": b, "strategy": "map"})) for b in (0, bounces))
+    assert same(direct, bounced)

@@ -69,9 +69,7 @@ def test_brick_minimum_of_a_sparse_grid():
     assert whole.shape == table.shape
     assert torch.equal(least[table[table >= 2].long()], whole[table >= 2])
     assert least[[0, 1, -1]].tolist() == [torch.inf, -torch.inf, torch.inf]
-
-
-def test_brick_minimum_of_another_grid():
+    # Of another grid
     _, pool, bricks = cut(sphere(8)[0], far=0.3)
     with pytest.raises(ValueError, match="brick_minimum: sdf must be"):
         brick_minimum(pool[:64], bricks)
@@ -106,14 +104,6 @@ def test_last_sample_of_a_ray_starts_no_section():
     assert not s.connected[ends].any()
     gaps = s.t.diff()[s.connected[:-1]]
     torch.testing.assert_close(gaps, torch.full_like(gaps, voxel))
-
-
-@pytest.mark.parametrize("shape", [(9, 5, 6), (4, 13, 2), (1, 1, 1)])
-def test_brick_minimum(shape):
-    sdf = torch.randn(shape)
-    with use_backend("reference"):
-        expected = brick_minimum(sdf)
-    assert torch.equal(brick_minimum(sdf), expected)
 
 
 def test_rays_that_miss_or_are_not_numbers_have_no_samples():

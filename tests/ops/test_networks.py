@@ -1,12 +1,29 @@
-"""The builder of small networks: layers, first weights, the op behind it."""
+"""Small networks: their op, the builder of layers and first weights, tables of directions."""
 
 import pytest
 import torch
+from op_cases import CASES, doubled, flat, fresh, function, unit
 from torch import nn
 from torch.nn.functional import normalize
 
 from univoxel.ops import use_backend
 from univoxel.ops.networks import FEWEST_ROWS, MLP, DirectionTable
+
+
+@pytest.mark.parametrize("wanted", [["x"], ["weights"], ["biases"], []])
+def test_gradients_of_some_arguments(wanted):
+    given, _ = fresh("mlp", doubled(CASES["mlp"](6)))
+    for name in given.keys() - {*wanted}:
+        value = given[name]
+        given[name] = [t.detach() for t in value] if isinstance(value, list) else value.detach()
+    out = function("mlp")(**given)
+    assert out.requires_grad == bool(wanted)
+    leaves = flat([given[name] for name in wanted])
+    if leaves:
+        found = torch.autograd.grad(out.square().sum(), leaves)
+        with use_backend("reference"):
+            out = function("mlp")(**given)
+            torch.testing.assert_close(found, torch.autograd.grad(out.square().sum(), leaves))
 
 
 def test_layers_end_linear():
@@ -42,15 +59,11 @@ def test_a_generator_draws_the_first_weights():
         assert 0.9 * bound < layer.weight.abs().max() <= bound
 
 
-def directions(n, seed=0):
-    return normalize(torch.randn(n, 3, generator=torch.Generator().manual_seed(seed)), dim=1)
-
-
 @pytest.mark.parametrize("levels", [0, 1, 5])
 def test_a_table_of_directions_is_zero_at_first(levels):
     table = DirectionTable(levels)
     assert table.levels == levels
-    found = table(directions(9))
+    found = table(unit(9))
     assert found.shape == (9, table.channels) == (9, 2 * levels)
     assert not found.any()
 
@@ -58,7 +71,7 @@ def test_a_table_of_directions_is_zero_at_first(levels):
 @pytest.mark.parametrize("level", range(6))
 def test_directions_meet_no_more_rows_than_a_table_says(level):
     table = DirectionTable(level + 1)
-    table(directions(100_000)).sum().backward()
+    table(unit(100_000)).sum().backward()
     met = table.table.grad.view(level + 1, -1, 2)[level].any(1).sum()
     most = table.rows_used(level)
     # the lattice has 5^3 nodes, 9^3, ...; most lie off the sphere, until nodes share rows
@@ -75,7 +88,7 @@ def test_a_table_learns_a_lamp_that_a_network_alone_blurs():
         lamp = normalize(torch.tensor([0.3, -0.5, 0.8]), dim=0)
         optimizer = torch.optim.Adam([*table.parameters(), *net.parameters()], lr=1e-2)
         for k in range(150):
-            way = directions(2048, seed=k)
+            way = unit(2048, seed=k)
             way[:512] = normalize(lamp + 0.3 * way[:512], dim=1)  # look at it more often
             wanted = (way @ lamp > 0.9976).float()
             miss = (net(torch.cat([way, table(way)], 1))[:, 0] - wanted).square().mean()
@@ -88,7 +101,7 @@ def test_a_table_learns_a_lamp_that_a_network_alone_blurs():
 
 
 def test_a_direction_feels_the_coarsest_levels_alone():
-    table, way = DirectionTable(5), directions(50).requires_grad_()
+    table, way = DirectionTable(5), unit(50).requires_grad_()
     fine = table.felt * table.rows
     with torch.no_grad():
         table.table[fine:].normal_()

@@ -1,118 +1,60 @@
-"""Shading from given directions: against the reference, closed forms, extremes."""
+"""Shading and lobes of light: closed forms, extremes, and ops that stand for one another."""
 
 import math
 
-import pytest
 import torch
-from check_op import SHADING_RTOL, check_op, uniform, unit
+from op_cases import CASES, doubled, fresh, function, normal, under_radiance
 
-from univoxel import sphere
-from univoxel.ops import shade_map, shade_map_reference, shade_radiance, shade_radiance_reference
+from univoxel import brdf
+from univoxel.ops import (
+    decode_lobes,
+    decode_lobes_reference,
+    shade_map,
+    shade_radiance,
+    shade_sg,
+    specular_response,
+    use_backend,
+)
 from univoxel.ops.shade import _shade_radiance
 
 
-def surface(g, n, count, roughness=(0.2, 1.0)):
-    """normal, wo, albedo, roughness, directions, solid_angle."""
-    normal = unit(g, n)
-    wo = torch.nn.functional.normalize(normal + 0.8 * unit(g, n), dim=-1)
-    albedo = uniform(g, 0, 1, n, 3).requires_grad_()
-    roughness = uniform(g, *roughness, n).requires_grad_()
-    directions = sphere.fibonacci_sphere(count, torch.float64)
-    return normal, wo, albedo, roughness, directions, 4 * math.pi / count
+def test_the_exponential_of_a_lobe_is_accurate():
+    """One direction straight up and lobes straight down: rgb is exp(-2 s) times a constant."""
+    s = torch.linspace(0, 40, 5001)  # 2 s is exact; exp(-80) / 300 is still a normal number
+    n = len(s)
+    up = torch.tensor([0.0, 0, 1]).expand(n, 3)
+    one = torch.ones(n, 1, 3)
+    args = (one, up, up, torch.zeros(n, 3), torch.ones(n), up[:1], torch.zeros(n))
+    rgb = shade_sg(-up[:, None], s[:, None], *args)[:, 0].double()
+    relative = rgb / rgb[0] / torch.exp(-2 * s.double()) - 1
+    # 2 ulp for the power of two, half an ulp for each of the few products around it; and sharpness
+    # times log2 e is rounded, which is as if sharpness were off by less than an ulp.
+    assert bool((relative.abs() < 4 * 2**-23 + 2 * s.double() * 2**-23).all())
 
 
-def lit(n, count, seed=0, roughness=(0.2, 1.0), f0=0.04):
-    g = torch.Generator().manual_seed(seed)
-    radiance = uniform(g, 0, 2, n, count, 3).requires_grad_()
-    return (radiance, *surface(g, n, count, roughness), f0)
-
-
-def mapped(n, count, points=5, seed=0, roughness=(0.2, 1.0), f0=0.04):
-    """Halves in float64: exact in every dtype. Visibility in 255ths."""
-    g = torch.Generator().manual_seed(seed)
-    map = uniform(g, 0, 2, count, 3).requires_grad_()
-    visibility = torch.randint(0, 256, (points, count), generator=g, dtype=torch.uint8)
-    indirect = uniform(g, 0, 1, points, count, 3).half().double()
-    index = torch.randint(0, max(points, 1), (n,), generator=g)
-    return (map, visibility, indirect, index, *surface(g, n, count, roughness), f0)
-
-
-def metals(case, seed=1):
-    """The same with an F0 per channel, black and white among them, and normals to learn."""
-    n = len(case[-7])
-    f0 = uniform(torch.Generator().manual_seed(seed), 0, 1, n, 3)
-    f0[:1, 0], f0[:1, 1] = 0, 1
-    return *case[:-7], case[-7].clone().requires_grad_(), *case[-6:-1], f0.requires_grad_()
-
-
-def for_unit_normals(op, at):
-    """gradcheck moves normals off the sphere, where op and reference need not agree."""
-
-    def normalised(*case):
-        unit = torch.nn.functional.normalize(case[at], dim=-1)
-        return op(*case[:at], unit, *case[at + 1 :])
-
-    return normalised
-
-
-def detached(case, dtype=torch.float32):
-    return [
-        a.detach().to(dtype) if isinstance(a, torch.Tensor) and a.is_floating_point() else a
-        for a in case
-    ]
-
-
-def in_halves(op):
-    return lambda map, visibility, indirect, *rest: op(map, visibility, indirect.half(), *rest)
-
-
-def test_radiance_native_equals_reference():
-    cases = [lit(3, 37), lit(1, 1, f0=0.5), lit(0, 16), lit(4, 64, roughness=(0.05, 0.2), f0=0.0)]
-    check_op(shade_radiance, shade_radiance_reference, cases, SHADING_RTOL)
-
-
-def test_map_native_equals_reference():
-    cases = [
-        mapped(6, 37),
-        mapped(1, 1, points=1, f0=0.5),
-        mapped(0, 16, points=0),
-        mapped(4, 64, roughness=(0.05, 0.2), f0=0.0),
-    ]
-    check_op(shade_map, shade_map_reference, cases, SHADING_RTOL)
-    check_op(in_halves(shade_map), in_halves(shade_map_reference), cases[:1], SHADING_RTOL)
-    map, visibility, *rest = mapped(6, 37)
-    check_op(
-        shade_map, shade_map_reference, [(map, visibility.double() / 255, *rest)], SHADING_RTOL
-    )
-
-
-@pytest.mark.parametrize("f0", ["number", "per channel"])
-def test_normals_and_metals_native_equals_reference(f0):
-    for op, reference, at, case in (
-        (shade_radiance, shade_radiance_reference, 1, lit),
-        (shade_map, shade_map_reference, 4, mapped),
-    ):
-        cases = [case(3, 37), case(0, 16), case(4, 64, roughness=(0.05, 0.2))]
-        behind = list(case(3, 20))
-        behind[-6] = -behind[-6]  # the eye
-        cases = [metals(c) for c in (*cases, tuple(behind))]
-        if f0 == "number":
-            cases = [(*c[:-1], 0.3) for c in cases]
-        check_op(for_unit_normals(op, at), for_unit_normals(reference, at), cases, SHADING_RTOL)
+def test_the_specular_response_is_the_shading_of_black_points():
+    """Its rows times a map; and they are 0 below the horizon."""
+    given = doubled(under_radiance(40, 96))
+    rays = {k: given[k] for k in ("normal", "wo", "roughness", "directions", "solid_angle")}
+    rows, map = specular_response(**rays), given["radiance"][0]
+    light, black = map.expand(40, -1, -1), torch.zeros(40, 3).double()
+    wanted = shade_radiance(light, albedo=black, f0=brdf.F0, **rays)
+    torch.testing.assert_close(rows @ map, wanted)
+    below = rays["normal"] @ rays["directions"].T < -1e-6
+    assert 0.3 < below.double().mean() < 0.7
+    assert (rows[below] == 0).all()
 
 
 def test_gradient_to_the_normal_takes_it_as_any_vector():
-    """Its part along the normal, which the normalisation above drops, is the reference's too."""
-    for op, reference, case in (
-        (shade_radiance, shade_radiance_reference, lit(40, 64)),
-        (shade_map, shade_map_reference, mapped(40, 64)),
-    ):
-        for full in (metals(case), (*metals(case)[:-1], 0.04)):
-            normal = full[-7]
-            (got,) = torch.autograd.grad(op(*full).square().sum(), normal)
-            (wanted,) = torch.autograd.grad(reference(*full).square().sum(), normal)
-            assert bool(((got * normal).sum(-1).abs() > 1e-3).any())
-            torch.testing.assert_close(got, wanted, rtol=1e-9, atol=1e-12)
+    """Its part along the normal, which unit normals leave out, is the reference's too."""
+    for case in ("shade_radiance", "shade_map", "shade_radiance of dielectrics"):
+        given, _ = fresh(case, doubled(CASES[case](40, directions=64)))
+        normal = given["normal"]
+        (got,) = torch.autograd.grad(function(case)(**given).square().sum(), normal)
+        with use_backend("reference"):
+            (wanted,) = torch.autograd.grad(function(case)(**given).square().sum(), normal)
+        assert bool(((got * normal).sum(-1).abs() > 1e-3).any())
+        torch.testing.assert_close(got, wanted, rtol=1e-9, atol=1e-12)
 
 
 def test_every_half_is_read_right():
@@ -132,15 +74,54 @@ def test_every_half_is_read_right():
 
 def test_fixed_light_gets_no_gradient():
     """Materials alone: the same gradients, and nothing computed for light and normal."""
-    for op, case in ((shade_radiance, lit(3, 16)), (shade_map, mapped(3, 16))):
-        materials = case[-5], case[-4]
-        learned = torch.autograd.grad(op(*metals(case)[:-1], 0.04).sum(), materials)
-        wanted = torch.autograd.grad(op(*case).sum(), materials)
-        fixed = (case[0].detach(), *case[1:])
-        got = torch.autograd.grad(op(*fixed).sum(), materials)
-        assert all(torch.equal(a, b) for a, b in zip(got, wanted, strict=True))
-        torch.testing.assert_close(got, learned, rtol=1e-12, atol=0)
-    *tensors, omega, f0 = detached(lit(3, 16))
+    for case, light in (("shade_radiance", "radiance"), ("shade_map", "map")):
+        learned, _ = fresh(case, doubled(CASES[case](3)) | {"f0": 0.04})
+        found = []
+        for fixed in ([], [light], ["normal"], [light, "normal"]):
+            given = learned | {name: learned[name].detach() for name in fixed}
+            materials = given["albedo"], given["roughness"]
+            found.append(torch.autograd.grad(function(case)(**given).sum(), materials))
+        for other in found[1:]:
+            torch.testing.assert_close(other, found[0], rtol=1e-12, atol=0)
+    given = under_radiance(3) | {"f0": torch.tensor(0.04)}
+    omega = given.pop("solid_angle")
+    tensors = (given[k] for k in ("radiance", "normal", "wo", "albedo", "roughness", "directions"))
     needs = [False, False, True, True, False]
-    grads = _shade_radiance.backward(*tensors, torch.tensor(f0), torch.ones(3, 3), omega, needs)
+    grads = _shade_radiance.backward(*tensors, given["f0"], torch.ones(3, 3), omega, needs)
     assert [g.numel() for g in grads] == [0, 0, 9, 3, 0]
+
+
+LOW, HIGH = 0.1, 30.0
+
+
+def test_closed_forms_of_lobes():
+    numbers = torch.tensor([[0.0, -3.0, 4.0, 0.0, 0.0, math.log(math.e - 1), -40.0]])
+    axis, sharpness, amplitude = decode_lobes(numbers, LOW, HIGH)
+    torch.testing.assert_close(axis, torch.tensor([[0.0, -0.6, 0.8]]))
+    torch.testing.assert_close(sharpness, torch.tensor([LOW + HIGH / 2]))
+    wanted = torch.tensor([[math.log(2), 1.0, math.exp(-40)]])
+    torch.testing.assert_close(amplitude, wanted, rtol=1e-5, atol=0)
+    numbers = torch.full((1, 7), math.nan)
+    for x in decode_lobes(numbers, LOW, HIGH):
+        assert x.isnan().all()
+
+
+def test_short_vectors_are_scaled():
+    """The gradient to a vector below the shortest does not turn it: it is 1e6 times the axis's."""
+    numbers = torch.zeros(1, 7, dtype=torch.float64)
+    numbers[0, :3] = torch.tensor([3e-8, 4e-8, 0.0])
+    numbers.requires_grad_()
+    axis, *_ = decode_lobes(numbers, LOW, HIGH)
+    torch.testing.assert_close(axis, 1e6 * numbers[:, :3])
+    (grad,) = torch.autograd.grad(axis @ axis.new_tensor([1.0, 2.0, 3.0]), numbers)
+    torch.testing.assert_close(grad[0, :3], grad.new_tensor([1e6, 2e6, 3e6]))
+
+
+def test_a_gradient_of_some_outputs():
+    numbers = normal(6, 7).double().requires_grad_()
+    for k in range(3):
+        got, wanted = (
+            torch.autograd.grad(op(numbers, LOW, HIGH)[k].square().sum(), numbers)[0]
+            for op in (decode_lobes, decode_lobes_reference)
+        )
+        torch.testing.assert_close(got, wanted)

@@ -1,4 +1,5 @@
-"""Hollows: a ball with a pit is opened, a mirror and a plain ball are left as they are."""
+"""Hollows: a ball with a pit is opened, a mirror and a plain ball are left as they are; which
+photographs say so, and whether there is time."""
 
 import dataclasses
 from functools import cache
@@ -6,10 +7,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from analytic import cameras_around, look_at
+from analytic import RADIUS, cameras_around, cameras_at, photos_of
 from cropped import cropped
 
-from univoxel.camera import Cameras, image_rays, pixel_rays
+from univoxel.camera import image_rays, pixel_rays
+from univoxel.color import linear_to_srgb
 from univoxel.data import Photos
 from univoxel.fields.grid import fit_grid
 from univoxel.preparation import carving
@@ -76,9 +78,7 @@ def from_above(views=VIEWS):
     z = torch.linspace(0.25, 0.95, views)
     phi = 2.4 * torch.arange(views)
     r = (1 - z * z).sqrt()
-    at = 2 * torch.stack([r * phi.cos(), r * phi.sin(), z], 1)
-    half = torch.full((views, 2), SIZE / 2)
-    return Cameras(torch.stack([look_at(p) for p in at]), half * 3, half, SIZE, SIZE)
+    return cameras_at(2 * torch.stack([r * phi.cos(), r * phi.sin(), z], 1), SIZE, 1.5 * SIZE)
 
 
 @cache
@@ -97,7 +97,7 @@ def opened(shape, look, cameras):
     return hull, carve_concavities(hull, grid, *photos), shape(grid.nodes()), grid.voxel_size
 
 
-def test_a_pit_is_opened():
+def test_a_pit_is_opened_and_the_new_surface_lies_where_it_is():
     hull, found, truth, voxel = opened(with_pit, checks, from_above())
     pit = (hull < -voxel) & (truth > voxel)  # what silhouettes leave in
     assert pit.sum() > 100
@@ -105,6 +105,10 @@ def test_a_pit_is_opened():
     rest = truth < -1.5 * voxel
     assert (found[rest] < 0).float().mean() > 0.99
     assert (found >= hull).all()
+    near = (truth.abs() < 2 * voxel) & (hull < -2 * voxel)
+    assert near.sum() > 100
+    assert (found - truth)[near].abs().median() < voxel
+    assert (hull - truth)[near].abs().median() > 1.5 * voxel
 
 
 def test_a_dark_pit_is_opened(monkeypatch):
@@ -130,14 +134,6 @@ def test_dark_colours_are_taken_further_apart():
     assert (again[:, 3] == 128).all()
 
 
-def test_the_new_surface_lies_where_the_pit_is():
-    hull, found, truth, voxel = opened(with_pit, checks, from_above())
-    near = (truth.abs() < 2 * voxel) & (hull < -2 * voxel)
-    assert near.sum() > 100
-    assert (found - truth)[near].abs().median() < voxel
-    assert (hull - truth)[near].abs().median() > 1.5 * voxel
-
-
 @pytest.mark.parametrize("look", [plain, noisy, mirrored])
 def test_what_photographs_cannot_tell_stays(look):
     """A plain ball says nothing, noise no more; a mirror shows all behind it but its outline."""
@@ -161,22 +157,17 @@ def test_each_rule_can_keep_the_pit_closed(rule, strict, monkeypatch):
 @cache
 def mostly_from_below():
     """A tenth of the cameras see into the pit."""
-    cameras = from_above()
-    low = torch.arange(VIEWS) < VIEWS * 9 // 10
-    at = cameras.camera_to_world[:, :, 3]
-    at = torch.where(low[:, None], at * torch.tensor([1.0, 1.0, -1.0]), at)
-    return Cameras(torch.stack([look_at(p) for p in at]), cameras.focal, cameras.centre, SIZE, SIZE)
+    at = from_above().camera_to_world[:, :, 3].clone()
+    at[: VIEWS * 9 // 10, 2] *= -1
+    return cameras_at(at, SIZE, 1.5 * SIZE)
 
 
 def test_what_few_views_see_through_stays(monkeypatch):
-    """They may all look at a lamp in something glossy."""
+    """They may all look at a lamp in something glossy; and two open nothing."""
     case = hull_of(with_pit, checks, mostly_from_below())
     assert torch.equal(carve_concavities(*case), case[0])
     monkeypatch.setattr(carving, "LEAST", 0.05)
     assert not torch.equal(carve_concavities(*case), case[0])
-
-
-def test_two_views_open_nothing():
     hull, found, _, _ = opened(with_pit, checks, from_above(2))
     assert torch.equal(found, hull)
 
@@ -210,3 +201,74 @@ def test_of_points_beyond_a_picture_its_own_nearest_pixel_is_taken():
     rays = pixel_rays(cameras, torch.tensor(0), pixel)
     _, found = carving._distance_and_pixel(rays.origin + 2 * rays.direction, cameras, 0)
     assert found.tolist() == [39 * SIZE + 29, 20 * SIZE + 29, 39 * SIZE]
+
+
+@pytest.fixture
+def small_hull():
+    grid = fit_grid(torch.tensor([-1.0] * 3), torch.tensor([1.0] * 3), 40_000)
+    return (grid.nodes().norm(dim=-1) - RADIUS).view(*grid.size), grid
+
+
+@pytest.mark.parametrize(("share", "opens"), [(0.8, False), (1.25, True)])
+@pytest.mark.parametrize("bits", [True, False])
+def test_hollows_are_opened_where_little_time_is_expected(
+    monkeypatch, small_hull, share, opens, bits
+):
+    """Seconds are a share of what the silhouettes' pixels take, shrunk to a voxel's width."""
+    sdf, grid = small_hull
+    monkeypatch.setattr(carving, "carve_concavities", lambda hull, *_: hull + 0.25)
+    photos = photos_of(3, 64)
+    if bits:
+        photos = dataclasses.replace(photos, alpha=(255 * photos.alpha).round().byte())
+    pictures, _ = carving.carving_pictures(photos, grid.voxel_size)
+    assert pictures.shape[1] == 32  # so that shrinking counts
+    pixels = pictures[..., 3].float().sum() / 255
+    found = carving.carve_within_time(
+        sdf, grid, photos, None, share * carving.PIXEL_SECONDS * float(pixels)
+    )
+    assert torch.equal(found, sdf + 0.25 if opens else sdf)
+
+
+def test_time_is_not_expected_of_photographs_that_are_left_out(monkeypatch, small_hull):
+    sdf, grid = small_hull
+    monkeypatch.setattr(carving, "carve_concavities", lambda hull, *_: hull + 0.25)
+    monkeypatch.setattr(carving, "VIEWS", 4)
+    seconds = carving.PIXEL_SECONDS * 5 * 32**2  # of four whole pictures, and more
+    assert torch.equal(
+        carving.carve_within_time(sdf, grid, photos_of(40, 64), None, seconds), sdf + 0.25
+    )
+
+
+def test_pictures_are_shrunk_to_what_a_voxel_shows():
+    """Pixels are 0.028 wide at the object."""
+    photos = photos_of(3, 64)
+    pictures, cameras = carving.carving_pictures(photos, 0.06)
+    assert pictures.shape == (3, 32, 32, 4)
+    assert (cameras.width, cameras.height) == (32, 32)
+    torch.testing.assert_close(cameras.focal * 2, photos.cameras.focal)
+    torch.testing.assert_close(cameras.centre * 2, photos.cameras.centre)
+    color, alpha = photos.picture(1)
+    whole = torch.cat([linear_to_srgb(color) * alpha[..., None], alpha[..., None]], -1)
+    wanted = 255 * whole[20:22, 24:26].mean((0, 1))
+    torch.testing.assert_close(pictures[1, 10, 12].float(), wanted, rtol=0, atol=0.51)  # rounded
+    assert carving.carving_pictures(photos, 0.02)[0].shape == (3, 64, 64, 4)
+
+
+def test_pictures_are_as_one_exposure_would_have_them():
+    photos, gains = photos_of(3, 64), torch.tensor([0.4, 0.0, -0.4])
+    photos = dataclasses.replace(photos, color=photos.color / 3)  # nothing is clipped
+    exposed = photos.color * gains.exp()[:, None, None, None]
+    exposed = dataclasses.replace(photos, color=exposed)
+    wanted = carving.carving_pictures(photos, 0.06)[0].int()
+    found = carving.carving_pictures(exposed, 0.06, gains)[0].int()
+    assert (found - wanted).abs().max() <= 1  # rounded
+    assert (carving.carving_pictures(exposed, 0.06)[0].int() - wanted).abs().max() > 10
+
+
+def test_of_many_photographs_some_say_what_is_hollow(monkeypatch):
+    monkeypatch.setattr(carving, "VIEWS", 4)
+    photos = photos_of(10, 16)
+    pictures, cameras = carving.carving_pictures(photos, 0.01)
+    assert len(pictures) == len(cameras) == 4
+    torch.testing.assert_close(cameras.camera_to_world, photos.cameras.camera_to_world[::3])
+    assert torch.equal(pictures[2, ..., 3], (255 * photos.alpha[6]).round().byte())

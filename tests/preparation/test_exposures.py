@@ -92,14 +92,11 @@ def test_photographs_that_share_few_points():
     assert rms(found - wanted) < 0.03  # 0.008 here
 
 
-def test_no_surface_says_nothing(photos, hull):
+def test_no_surface_and_a_black_photograph_say_nothing(photos, hull):
     sdf, grid = hull
     seen = brightness_of(photos, sdf.abs() + 1, grid)
     assert not log_gains(seen).any()
     assert contradictions_left(seen) == 1
-
-
-def test_a_black_photograph_says_nothing(photos, hull):
     dark = photos.color.clone()
     dark[3] = 0
     found = log_gains(brightness_of(replace(photos, color=dark), *hull))
@@ -161,6 +158,7 @@ def test_nothing_is_looked_for_that_was_not_asked_for(photos, hull, monkeypatch)
 
 @pytest.mark.parametrize(("gain", "told"), [(1.0, False), (64.0, True)])
 def test_much_that_is_overexposed_is_said(photos, caplog, gain, told):
+    """And linear photographs are not clipped."""
     caplog.set_level("INFO", "univoxel")
     encoded = (255 * linear_to_srgb(gain * photos.color)).round().byte()
     eight_bits = replace(photos, color=encoded, alpha=(255 * photos.alpha).round().byte())
@@ -170,7 +168,4 @@ def test_much_that_is_overexposed_is_said(photos, caplog, gain, told):
     expected = (seen > 255 * CLIPPED).any(1).float().mean()
     assert task.clipped_share(eight_bits) == pytest.approx(float(expected), abs=1e-6)
     assert (expected > 0.5) == told
-
-
-def test_linear_photographs_are_not_clipped(photos):
     assert task.clipped_share(replace(photos, color=100 * photos.color)) == 0

@@ -27,13 +27,8 @@ def test_mask_distance_is_signed_and_subpixel():
     assert d[4, 4] == -2.5  # the middle of a square of side 5
     assert d[4, 0] == 1.5  # two pixels left of the first covered one, whose edge is half nearer
     assert d[4, 7] == 0.25  # a quarter covered: the edge lies a quarter pixel inwards of its middle
-
-
-def test_an_empty_mask_is_far_outside_everywhere():
     assert (hull.mask_distances(torch.zeros(1, 4, 6)) == 6).all()
-
-
-def test_the_edge_of_a_picture_is_no_silhouette():
+    # The edge of a picture is no silhouette
     alpha = torch.zeros(3, 8, 12)
     alpha[0, 3:] = 1  # leaves the picture below, left and right
     alpha[1] = 1
@@ -64,6 +59,9 @@ def test_votes_keep_what_one_mask_lacks(silhouettes):
 
 def test_as_many_votes_are_needed_as_bad_masks_are_outvoted_by():
     assert [hull.votes_needed(n) for n in (1, 4, 6, 12, 40, 135)] == [1, 1, 2, 2, 3, 9]
+    assert hull.views_needed(100, 1) == 1
+    assert hull.views_needed(100, 7) == 25
+    assert hull.views_needed(2, 2) == 1
 
 
 def test_bounds_enclose_the_sphere_with_little_to_spare(silhouettes):
@@ -72,6 +70,9 @@ def test_bounds_enclose_the_sphere_with_little_to_spare(silhouettes):
     assert (upper > RADIUS).all()
     # margin: 3 % of the diagonal and a voxel, on top of a hull that is somewhat larger
     assert (upper - lower).max() < 2 * RADIUS * 1.35
+    distance, cameras = silhouettes
+    with pytest.raises(ValueError, match="silhouettes of the photographs have no common volume"):
+        hull.estimate_bounds(torch.full_like(distance, 5.0), cameras)
 
 
 def test_hull_is_the_sphere_up_to_its_facets(silhouettes):
@@ -101,12 +102,6 @@ def test_a_silhouette_cut_by_the_border_says_nothing_beyond_it(silhouettes):
     assert hull.hull_sdf(distance[:1], one, beside) > 0
     assert hull.hull_sdf(torch.full((1, 64, 64), -3.0), one, torch.zeros(1, 3)) < 0
     assert hull.hull_sdf(torch.full((1, 64, 64), -3.0), one, beside) == torch.inf  # nobody sees it
-
-
-def test_no_common_volume_is_an_error(silhouettes):
-    distance, cameras = silhouettes
-    with pytest.raises(ValueError, match="silhouettes of the photographs have no common volume"):
-        hull.estimate_bounds(torch.full_like(distance, 5.0), cameras)
 
 
 def test_fit_grid_has_cubic_voxels_and_covers_the_box():
@@ -139,12 +134,6 @@ def test_what_few_views_see_is_carved_by_half_of_them_and_ends_where_too_few_do(
     assert (hull.hull_sdf(distance[:3], few, ball, votes=8) < 0).all()
     assert (hull.hull_sdf(distance[:3], few, ball, votes=8, seen_by=3) < 0).all()
     assert hull.hull_sdf(distance[:3], few, ball, votes=8, seen_by=4).isposinf().all()
-
-
-def test_where_masks_are_believed_one_view_is_enough():
-    assert hull.views_needed(100, 1) == 1
-    assert hull.views_needed(100, 7) == 25
-    assert hull.views_needed(2, 2) == 1
 
 
 def test_distances_of_large_pictures_are_those_of_smaller_ones():

@@ -95,26 +95,19 @@ def ball():
     return pinned(mirror)
 
 
-def test_a_mirror_is_held(ball):
-    found, _ = ball
-    assert found.pinned.float().mean() > 0.8
-
-
-@pytest.mark.parametrize("look", [paint, far_side])
-def test_paint_and_hollows_are_not(look):
-    found, _ = pinned(look)
-    assert found is None
-
-
-def test_neighbours_that_agree_prove_nothing():
-    """Without points that are turned away from one another there is no table."""
-    found, _ = pinned(mirror, TURN=180.0)
-    assert found is None
-
-
-def test_a_few_points_that_agree_are_chance():
-    assert pinned(half)[0] is not None
-    assert pinned(half, LEAST_SHARE=0.9)[0] is None
+@pytest.mark.parametrize(
+    ("look", "constants"),
+    [
+        *((look, {}) for look in (paint, far_side)),
+        # Neighbours that agree: without points turned away from one another there is no table
+        (mirror, {"TURN": 180.0}),
+        (half, {"LEAST_SHARE": 0.9}),  # a few points that agree are chance
+        (mirror, {"STRONG_CHANGE": 0.9}),  # regions begin with the strongest changes
+        (mirror, {"MIN_VIEWS": VIEWS}),  # points that few photographs show
+    ],
+)
+def test_what_proves_nothing_is_not_held(look, constants):
+    assert pinned(look, **constants)[0] is None
 
 
 def test_paint_that_mirrors_a_part_is_not_pinned():
@@ -133,14 +126,6 @@ def test_changes_that_hardly_follow_the_table_prove_nothing():
     any_gain = {"GAIN": 0.0, "CHANGE": 0.05, "STRONG_CHANGE": 0.05, "WEAK_CHANGE": 0.05}
     assert pinned(noisy, **any_gain, CORRELATION=0.9)[0] is None
     assert pinned(noisy, **any_gain)[0] is not None
-
-
-def test_regions_begin_with_the_strongest_changes():
-    assert pinned(mirror, STRONG_CHANGE=0.9)[0] is None
-
-
-def test_points_that_few_photographs_show_are_left_out():
-    assert pinned(mirror, MIN_VIEWS=VIEWS)[0] is None
 
 
 def test_what_mirrors_the_object_tells_nothing(monkeypatch):
@@ -185,7 +170,7 @@ def test_regions_take_in_holes_and_what_is_weak_beside_them():
     assert not grown(strong & (line > 17), weak, nearest).any()
 
 
-def test_nodes_near_held_points_stay(ball):
+def test_nodes_near_the_held_points_of_a_mirror_stay(ball):
     found, hull = ball
     nodes = found.nodes(hull, GRID)
     near = hull.abs() < task.BAND * GRID.voxel_size
@@ -193,6 +178,7 @@ def test_nodes_near_held_points_stay(ball):
     assert nodes.sum() > 0.8 * near.sum()
     upper = replace(found, pinned=found.position[:, 2] > 0)
     assert (GRID.nodes()[upper.nodes(hull, GRID)][:, 2] > -0.1).all()
+    assert found.pinned.float().mean() > 0.8
 
 
 def test_the_hull_is_put_back_once_and_gets_no_gradient(ball):
@@ -218,7 +204,7 @@ def test_the_hull_is_put_back_once_and_gets_no_gradient(ball):
     assert (gradient[~stays.flatten()[rows]] > 0).all()
 
 
-def test_which_bricks_are_empty_is_looked_at_again(ball):
+def test_which_bricks_are_empty_is_looked_at_again_and_bricks_are_let_go(ball):
     """In training it is not by itself."""
     found, hull = ball
     field = dense_field(GRID, 2, hull + 0.2).train()
@@ -227,10 +213,6 @@ def test_which_bricks_are_empty_is_looked_at_again(ball):
     after = field.distances.brick_minimum()
     assert torch.equal(after, field.eval().distances.brick_minimum())
     assert not torch.equal(after, before)
-
-
-def test_bricks_are_let_go(ball):
-    found, hull = ball
     field = dense_field(GRID, 2, hull).in_bricks(GridShape(GRID.origin, GRID.voxel_size, GRID.size))
     before = field.sdf.clone()
     found.pin_(field)
@@ -273,30 +255,25 @@ def test_what_is_held_is_not_carved(tmp_path, monkeypatch):
     assert stays.any()
 
 
-def test_rough_masks_hold_nothing(tmp_path):
-    assert prepare(replace(silhouettes_of(half), votes=2), draft(tmp_path)).pinned is None
-
-
-@pytest.mark.parametrize("varying", ["exposure", "light"])
-def test_photographs_that_differ_pin_nothing(tmp_path, varying):
-    cfg = draft(tmp_path)
-    prepared = prepare(
-        silhouettes_of(half), replace(cfg, scene=replace(cfg.scene, varying=varying))
-    )
-    assert prepared.pinned is None
-    assert pinned_in(prepared.silhouettes, build_scene(prepared, cfg), cfg) is None
+TURNTABLE = Turntable((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
 
 
 @pytest.mark.parametrize(
-    "frame",
+    ("masks", "varying", "frame"),
     [
-        LightFrame(Turntable((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))),
-        LightFrame(flash=2.0),
+        ({"votes": 2}, "none", None),  # rough ones
+        # Photographs that differ, and light that moves with the camera
+        ({}, "exposure", None),
+        ({}, "light", None),
+        ({}, "none", LightFrame(TURNTABLE)),
+        ({}, "none", LightFrame(flash=2.0)),
     ],
 )
-def test_light_that_moves_with_the_camera_pins_nothing(tmp_path, monkeypatch, frame):
-    silhouettes, cfg = silhouettes_of(half), draft(tmp_path)
-    monkeypatch.setattr("univoxel.preparation.prepare.light_frame_of", lambda *_: frame)
-    prepared = prepare(silhouettes, cfg)
+def test_where_nothing_is_held(tmp_path, monkeypatch, masks, varying, frame):
+    cfg, silhouettes = draft(tmp_path), replace(silhouettes_of(half), **masks)
+    if frame is not None:
+        monkeypatch.setattr("univoxel.preparation.prepare.light_frame_of", lambda *_: frame)
+    prepared = prepare(silhouettes, replace(cfg, scene=replace(cfg.scene, varying=varying)))
     assert prepared.pinned is None
-    assert pinned_in(silhouettes, build_scene(prepared, cfg), cfg) is None
+    if not masks:
+        assert pinned_in(silhouettes, build_scene(prepared, cfg), cfg) is None

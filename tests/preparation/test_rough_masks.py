@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from analytic import RADIUS, look_at, photos_of
+from analytic import RADIUS, cameras_at, on_circle, photos_of
 from scipy.spatial.transform import Rotation
 
 from lab.stress.damage import turned
@@ -154,13 +154,10 @@ def test_preparation_doubts_what_contradicts_and_starts_from_what_agrees(
 
 def turned_over(first: int, second: int) -> Cameras:
     """Two rings of level cameras: the object was turned over between them."""
-    angle = 2 * torch.pi * torch.cat([torch.arange(n) / n for n in (first, second)])
-    place = torch.stack([angle.cos(), angle.sin(), torch.full_like(angle, 0.5)], 1)
-    poses = torch.stack([look_at(3 * p) for p in place])
+    cameras = cameras_at(torch.cat([on_circle(n, 3.0, 1.5) for n in (first, second)]), SIZE, 160)
     over = torch.from_numpy(Rotation.from_rotvec([2.8, 0.2, 0.0]).as_matrix()).float()
-    poses[first:] = over @ poses[first:]
-    focal = torch.full((first + second, 2), 160.0)
-    return Cameras(poses, focal, torch.full_like(focal, SIZE / 2), SIZE, SIZE)
+    cameras.camera_to_world[first:] = over @ cameras.camera_to_world[first:]
+    return cameras
 
 
 def ball_with_a_lid(cameras: Cameras, lid: tuple[float, float, float]) -> list[torch.Tensor]:

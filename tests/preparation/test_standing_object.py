@@ -1,7 +1,6 @@
 """The object told by depth alone: planes behind it, and what stands before them."""
 
 import numpy as np
-import pytest
 import textured_room
 import torch
 from spoilt_masks import iou, without_depth
@@ -17,14 +16,7 @@ from univoxel.preparation.standing_object import (
     middle_part,
     surface_nodes,
 )
-from univoxel.preparation.stereo import depth_maps, reach
-
-
-@pytest.fixture(scope="module")
-def room():
-    """Photographs of an object on a floor, in a room with furniture, and their depth maps."""
-    photos = textured_room.photos_of(textured_room.orbit(30, 200, 150))
-    return photos, depth_maps(photos)
+from univoxel.preparation.stereo import reach
 
 
 def test_masks_are_those_of_the_object(room):
@@ -63,8 +55,9 @@ def test_a_box_leaves_the_table_out(room):
     assert np.mean([iou(a, b) for a, b in zip(found, true, strict=True)]) > 0.8
 
 
-def test_a_box_in_the_air_has_nothing(room):
+def test_a_box_in_the_air_and_no_match_have_nothing(room):
     assert masks_by_depth(room[1], box_corners((0.9, 0.9, 0.6, 1.2, 1.2, 0.9))) is None
+    assert masks_by_depth(without_depth(room[0].cameras)) is None
 
 
 def test_the_plane_is_the_floor(room):
@@ -78,10 +71,6 @@ def test_the_plane_is_the_floor(room):
     part = grid.nodes()[middle_part(maps, grid, surface, planes)]
     assert part[:, 2].min() > 0
     assert part[:, :2].norm(dim=1).max() < 0.7  # neither furniture nor walls
-
-
-def test_nothing_stands_out_where_nothing_is_matched(room):
-    assert masks_by_depth(without_depth(room[0].cameras)) is None
 
 
 def test_a_plane_through_points():

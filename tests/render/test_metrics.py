@@ -1,4 +1,4 @@
-"""Metrics against cases small enough to compute by hand."""
+"""Metrics and losses against cases small enough to compute by hand."""
 
 import math
 
@@ -14,15 +14,9 @@ def gray(value, size=4):
     return torch.full((size, size, 3), float(value))
 
 
-def test_psnr_of_a_constant_difference():
+def test_psnr():
     assert metrics.psnr(gray(0.5), gray(0.6)) == pytest.approx(20.0, abs=1e-5)  # 0.1^2
-
-
-def test_psnr_of_equal_pictures_is_finite():
     assert metrics.psnr(gray(0.5), gray(0.5)) == 100.0
-
-
-def test_psnr_counts_only_the_mask():
     picture, mask = gray(0.5), torch.zeros(4, 4, dtype=torch.bool)
     picture[0, 0], mask[0, 0] = 1.0, True
     assert metrics.psnr(picture, gray(0.5)) == pytest.approx(-10 * math.log10(0.25 / 16))
@@ -35,13 +29,10 @@ def test_on_black_encodes_the_product():
     assert picture.flatten().tolist() == pytest.approx([0.735357] * 3, abs=1e-6)
 
 
-def test_ssim_of_constants_is_the_luminance_term():
+def test_ssim():
     a, b, c1 = 0.5, 0.6, 0.01**2
     expected = (2 * a * b + c1) / (a * a + b * b + c1)
     assert metrics.ssim(gray(a, 16), gray(b, 16)) == pytest.approx(expected, rel=1e-6)
-
-
-def test_ssim_of_equal_noise_is_one_and_of_inverted_noise_is_negative():
     noise = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0))
     assert metrics.ssim(noise, noise) == pytest.approx(1.0)
     assert metrics.ssim(noise, 1 - noise) < 0
@@ -81,10 +72,12 @@ def test_a_channel_that_is_black_in_the_truth_keeps_what_was_found_in_it(red):
     assert metrics.albedo_scale(truth, albedo, everywhere, 1).tolist() == [1.5] * 3
 
 
-def test_roughness_mse_counts_only_the_mask():
+def test_only_the_mask_counts_and_no_normal_is_a_right_angle():
     roughness = torch.tensor([[0.5, 0.9]])
     truth, mask = torch.tensor([[0.3, 0.0]]), torch.tensor([[True, False]])
     assert metrics.roughness_mse(roughness, truth, mask) == pytest.approx(0.04)
+    mask = torch.ones(1, dtype=torch.bool)
+    assert metrics.normal_mae(torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]]), mask) == 90.0
 
 
 @pytest.mark.parametrize("degrees", [0.0, 0.001, 30.0, 90.0, 180.0])
@@ -95,11 +88,6 @@ def test_normal_mae_of_known_angles(degrees):
     mask = torch.tensor([True, False])
     # truth comes in half precision, so its length is off
     assert metrics.normal_mae(a, 1.001 * b, mask) == pytest.approx(degrees, abs=1e-6)
-
-
-def test_normal_mae_of_nothing_is_a_right_angle():
-    mask = torch.ones(1, dtype=torch.bool)
-    assert metrics.normal_mae(torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]]), mask) == 90.0
 
 
 def test_chamfer_of_shifted_points():
@@ -177,3 +165,15 @@ def test_ssim_where_little_differs_is_that_of_the_whole(size, place):
         use_sample_covariance=False,
     )
     assert metrics.ssim(picture, other) == pytest.approx(whole, abs=1e-9)
+
+
+def test_losses():
+    target = torch.tensor([[1.0, 0.5, 1.0]])
+    drawn = torch.tensor([[1.7, 0.6, 0.9]], requires_grad=True)
+    loss = metrics.photometric(drawn, target)
+    assert loss.item() == pytest.approx((0.0 + 0.1 + 0.1) / 3)
+    loss.backward()
+    torch.testing.assert_close(drawn.grad, torch.tensor([[0.0, 1 / 3, -1 / 3]]))
+    a = torch.rand(5)
+    assert metrics.silhouette(a, a) == 0
+    assert metrics.silhouette(a + 0.5, a).item() == pytest.approx(0.25)

@@ -106,6 +106,11 @@ def test_a_hard_shadow_is_black_and_sharp():
     hidden = torch.tensor([True, False, False, False])
     shadow = task.ground_shadow(rays, 0.0, lid(), lighting, samples=1, bounces=0, hidden=hidden)
     assert shadow.tolist() == [0, 1, 0, 0]
+    # Rays that miss the floor, and light that comes back
+    up = Rays(torch.tensor([[0.0, 0, 5], [0, 0, -5]]), torch.tensor([[0.0, 0, 1], [0, 0, 1]]))
+    lighting = task.Lighting(tables(WHITE))
+    shadow = task.ground_shadow(up, 0.0, lid(), lighting, samples=4, bounces=0)
+    assert shadow.eq(0).all()
 
 
 def test_a_soft_shadow_is_the_sky_that_is_hidden():
@@ -119,13 +124,6 @@ def test_a_soft_shadow_is_the_sky_that_is_hidden():
     # The floor's BRDF is not quite Lambertian at grazing light: 2 %.
     assert float(shadow[0]) == pytest.approx(4 * quarter, rel=0.02)
     assert float(shadow[1]) < 1e-3
-
-
-def test_rays_that_miss_the_floor_and_light_that_comes_back():
-    up = Rays(torch.tensor([[0.0, 0, 5], [0, 0, -5]]), torch.tensor([[0.0, 0, 1], [0, 0, 1]]))
-    lighting = task.Lighting(tables(WHITE))
-    shadow = task.ground_shadow(up, 0.0, lid(), lighting, samples=4, bounces=0)
-    assert shadow.eq(0).all()
 
 
 def pictures(background, ground, opacity=0.5):

@@ -190,7 +190,7 @@ def test_the_right_map_stays():
     torch.testing.assert_close(found, albedo[point], atol=1e-4, rtol=1e-3)
 
 
-def test_paint_is_told_from_what_the_layer_mirrors():
+def test_paint_is_told_from_what_the_layer_mirrors(monkeypatch):
     scene, problem, albedo = painted(lamps(NODES), shiny=True)
     known(scene, lamps(NODES))
     offsets = problem.observations.offsets.clone()
@@ -207,6 +207,11 @@ def test_paint_is_told_from_what_the_layer_mirrors():
     mirrored = problem.observations.color.view(POINTS, 4, 3).std(1).mean()
     assert mirrored > 0.01
     torch.testing.assert_close(found[1:], albedo[1:], atol=1e-3, rtol=1e-2)
+    # In parts
+    monkeypatch.setattr(albedo_entropy, "POINTS_AT_ONCE", 70)
+    torch.testing.assert_close(
+        albedo_entropy.diffuse_albedo(scene, problem), albedo, atol=1e-3, rtol=1e-2
+    )
 
 
 def test_of_gains_paint_knows_nothing():
@@ -232,12 +237,3 @@ def test_entropy_counts_the_colours():
     # Nearly as many cells as points; some share an entry of the table
     assert 0.9 * math.log(2000) < found[2] < math.log(2000)
     assert (5 / albedo_entropy.CELL) ** 3 > 10 * 2000
-
-
-def test_albedos_come_in_parts(monkeypatch):
-    scene, problem, albedo = painted(lamps(NODES), shiny=True)
-    known(scene, lamps(NODES))
-    monkeypatch.setattr(albedo_entropy, "POINTS_AT_ONCE", 70)
-    torch.testing.assert_close(
-        albedo_entropy.diffuse_albedo(scene, problem), albedo, atol=1e-3, rtol=1e-2
-    )

@@ -153,12 +153,6 @@ def test_roughness_is_eliminated_by_the_schur_complement_too():
     assert torch.allclose(to_rough, solution[51:], **found)
 
 
-@pytest.mark.parametrize(("count", "size"), [(30, 12), (3, 10), (5, 1), (0, 4)])
-def test_gram_is_the_product_with_the_transpose(count, size):
-    matrix = torch.randn(count, size, dtype=torch.float64)
-    torch.testing.assert_close(equations.gram(matrix), matrix.T @ matrix)
-
-
 def test_laplacian():
     direction = fibonacci_sphere(200)
     matrix = equations.graph_laplacian(direction, 6)

@@ -181,16 +181,15 @@ def test_rounds_spread_over_the_steps_that_are_left(monkeypatch, rooms, newton, 
         return {"joint": scene.sky.log_radiance.square().sum()}
 
     scene = sphere_scene(8)
-    monkeypatch.setattr(
-        joint_solve, "build_problem", lambda *_: random_problem(nodes=8, scene=scene)
-    )
-    monkeypatch.setattr(joint_solve, "objective", objective)
-    monkeypatch.setattr(joint_solve, "RowAdam", Optimizer)
-    monkeypatch.setattr(joint_solve, "find_metal", lambda *_: torch.zeros(5, dtype=torch.bool))
-    monkeypatch.setattr(
-        joint_solve, "initialise_", lambda scene, problem, decisions, *_: (decisions, [])
-    )
-    monkeypatch.setattr(joint_solve, "newton_round_", newton_round_)
+    for name, stand_in in {
+        "build_problem": lambda *_: random_problem(nodes=8, scene=scene),
+        "objective": objective,
+        "RowAdam": Optimizer,
+        "find_metal": lambda *_: torch.zeros(5, dtype=torch.bool),
+        "initialise_": lambda scene, problem, decisions, *_: (decisions, []),
+        "newton_round_": newton_round_,
+    }.items():
+        monkeypatch.setattr(joint_solve, name, stand_in)
     cfg = JointConfig(rounds=4, lr_sdf=0.0)  # the objective above says nothing of the surface
     joint_solve.solve(scene, photos_of(1, 8), cfg, 0, steps)
     assert when == newton
@@ -331,29 +330,37 @@ def test_roughness_follows_newtons_points():
     assert torch.equal(metallic, before[2])
 
 
-def test_materials_follow_a_map_that_was_changed(monkeypatch):
-    """Albedo goes to what the photographs say; the rest, metals, and what none sees stay."""
+def taught(teach, *arguments):
+    """Materials of a sphere before and after a lesson from features that are 0."""
     torch.manual_seed(0)
     scene = sphere_scene(12)
     problem = problem_on_a_sphere(600, 4, 12, scene)
-    wanted = torch.where(problem.observations.normal[:, :1] > 0, RED, BLUE)
-    told = wanted.clone()
-    told[:20] = torch.nan
-    metal = problem.observations.normal[:, 2] > 0.5
-    told[metal] = 1.0
-    monkeypatch.setattr(joint_solve, "diffuse_albedo", lambda *_: told)
-    features = scene.field.features_at(problem.observations.position)
-    before = [m.detach() for m in scene.material(features)]
-    cfg = replace(CFG, rays=512, lr_features=0.2, lr_networks=0.03)  # from features that are 0
-    joint_solve.teach_albedo_(scene, problem, MaterialLabels(metal), cfg)
-    after = scene.material(scene.field.features_at(problem.observations.position))
-    # Between red, blue and metal features are mixed
-    matte = (problem.observations.normal[:, 0].abs() > 0.3) & (
-        problem.observations.normal[:, 2] < 0.2
+    position = problem.observations.position
+    before = scene.material(scene.field.features_at(position))
+    cfg = replace(CFG, rays=512, lr_features=0.2, lr_networks=0.03)
+    teach(scene, problem, *(a(problem.observations.normal) for a in arguments), cfg)
+    after = scene.material(scene.field.features_at(position))
+    materials = ([m.detach() for m in several] for several in (before, after))
+    return problem.observations.normal, *materials
+
+
+def test_materials_follow_a_map_that_was_changed(monkeypatch):
+    """Albedo goes to what the photographs say; the rest, metals, and what none sees stay."""
+
+    def told(_, problem):
+        normal = problem.observations.normal
+        said = torch.where(normal[:, :1] > 0, RED, BLUE)
+        said[:20], said[normal[:, 2] > 0.5] = torch.nan, 1.0
+        return said
+
+    monkeypatch.setattr(joint_solve, "diffuse_albedo", told)
+    normal, before, after = taught(
+        joint_solve.teach_albedo_, lambda normal: MaterialLabels(normal[:, 2] > 0.5)
     )
-    held = problem.observations.normal[:, 2] > 0.8
-    off = (before[0] - wanted).abs().mean(1)
-    error = (after[0].detach() - wanted).abs().mean(1)
+    wanted = torch.where(normal[:, :1] > 0, RED, BLUE)
+    # Between red, blue and metal features are mixed
+    matte, held = (normal[:, 0].abs() > 0.3) & (normal[:, 2] < 0.2), normal[:, 2] > 0.8
+    off, error = ((albedo - wanted).abs().mean(1) for albedo in (before[0], after[0]))
     assert error[matte].mean() < 0.2 * off[matte].mean()
     assert (after[0] - before[0]).abs()[held].mean() < 0.2 * off[held].mean()
     for now, was in zip(after[1:], before[1:], strict=True):
@@ -361,20 +368,14 @@ def test_materials_follow_a_map_that_was_changed(monkeypatch):
 
 
 def test_mirrors_are_learned_and_do_not_pull_the_rest_along():
-    torch.manual_seed(0)
-    scene = sphere_scene(12)
-    problem = problem_on_a_sphere(600, 4, 12, scene)
-    height = problem.observations.normal[:, 2]
-    sharp, base = height > 0.5, torch.tensor([0.9, 0.6, 0.3]).expand(600, 3)
-    mirrors = Mirrors(sharp, sharp, problem.observations.normal, base)
-    position = problem.observations.position
-    before = [m.detach() for m in scene.material(scene.field.features_at(position))]
-    cfg = replace(CFG, rays=512, lr_features=0.2, lr_networks=0.03)  # from features that are 0
-    joint_solve.teach_mirrors_(scene, problem, mirrors, cfg)
-    albedo, roughness, metallic = (
-        m.detach() for m in scene.material(scene.field.features_at(position))
-    )
-    inside, outside = height > 0.8, height < 0.2
+    base = torch.tensor([0.9, 0.6, 0.3]).expand(600, 3)
+
+    def mirrors(normal):
+        return Mirrors(normal[:, 2] > 0.5, normal[:, 2] > 0.5, normal, base)
+
+    normal, before, after = taught(joint_solve.teach_mirrors_, mirrors)
+    albedo, roughness, metallic = after
+    inside, outside = normal[:, 2] > 0.8, normal[:, 2] < 0.2
     assert (albedo - base)[inside].abs().mean() < 0.1
     assert roughness[inside].mean() < 0.05 + 0.2 * (before[1][inside].mean() - 0.05)
     assert metallic[inside].mean() > 0.5  # from 0.02; the solve goes on with it
@@ -391,20 +392,19 @@ def test_without_paint_materials_stay(monkeypatch):
     assert all(torch.equal(after[k], before[k]) for k in after)
 
 
+STAGE = plain_stage(voxels=0.01, iterations=10, share=0.4, rays=256, physical_from=0.5)
+JOINT = JointConfig(iterations=20, points=300, newton_points=100, rays=256, tracing=1)
+
+
+def training(data, tmp_path, *stages):
+    sizes = small_scene(sky_nodes=32)
+    return plain_training(data, tmp_path / "run", stages, minutes=60.0, scene=sizes)
+
+
 def test_a_solve_that_was_killed_goes_on_in_its_round(data, tmp_path, monkeypatch):
     """Map, materials and round are those of the checkpoint; nothing before is done again."""
-    stages = (
-        plain_stage(voxels=0.01, iterations=10, share=0.4, rays=256, physical_from=0.5),
-        JointConfig(iterations=30, rounds=3, points=300, newton_points=100, rays=256, tracing=1),
-    )
-    sizes = small_scene(sky_nodes=32)
-    cfg = plain_training(data, tmp_path / "run", stages, minutes=5.0, scene=sizes)
-    started, newtons, steps = [], [], []
-    initialise_, newton_round, objective = (
-        joint_solve.initialise_,
-        joint_solve.newton_round_,
-        joint_solve.objective,
-    )
+    cfg = training(data, tmp_path, STAGE, replace(JOINT, iterations=30, rounds=3))
+    started, newtons, steps, objective = [], [], [], joint_solve.objective
 
     def killed(*arguments):
         steps.append(arguments[0].sky.log_radiance.detach().clone())
@@ -412,14 +412,14 @@ def test_a_solve_that_was_killed_goes_on_in_its_round(data, tmp_path, monkeypatc
             raise KeyboardInterrupt
         return objective(*arguments)
 
+    def noted(name, when):
+        original = getattr(joint_solve, name)
+        monkeypatch.setattr(joint_solve, name, lambda *a: when.append(len(steps)) or original(*a))
+
     monkeypatch.setattr(progress, "CHECKPOINT_SECONDS", 0.0)  # after each step
     monkeypatch.setattr(joint_solve, "objective", killed)
-    monkeypatch.setattr(
-        joint_solve, "initialise_", lambda *a: started.append(len(steps)) or initialise_(*a)
-    )
-    monkeypatch.setattr(
-        joint_solve, "newton_round_", lambda *a: newtons.append(len(steps)) or newton_round(*a)
-    )
+    noted("initialise_", started)
+    noted("newton_round_", newtons)
     with pytest.raises(KeyboardInterrupt):
         train_task.train(cfg)
     _, saved = load_checkpoint(cfg.out)
@@ -430,23 +430,15 @@ def test_a_solve_that_was_killed_goes_on_in_its_round(data, tmp_path, monkeypatc
     train_task.train(cfg, resume=True)
     assert started == [0]
     assert newtons[:2] == [0, 10]  # that of the second round is not made again
-    assert newtons[2:] in (
-        [15 + 7],
-        [15 + 8],
-    )  # what is left of its 10 steps, or by rounding one more
+    # What is left of its 10 steps, or by rounding one more
+    assert newtons[2:] in ([15 + 7], [15 + 8])
     assert len(steps) == 15 + 30 - 13
     assert torch.equal(steps[15], steps[14])  # the map goes on where it was
     assert load_checkpoint(cfg.out)[1]["within"] is None
 
 
 def test_a_refit_leaves_materials_bit_for_bit(data, tmp_path, monkeypatch):
-    stage = plain_stage(voxels=0.01, iterations=30, share=0.4, rays=256, physical_from=0.5)
-    stages = (
-        stage,
-        JointConfig(iterations=20, points=300, newton_points=100, rays=256, tracing=1),
-        replace(stage, iterations=10, refit=True, physical_from=0.0),
-    )
-    sizes = small_scene(sky_nodes=32)
+    refit = replace(STAGE, refit=True, physical_from=0.0)
     run_stage, states = train_task.run_stage, []
 
     def watched(scene, *rest):
@@ -455,7 +447,7 @@ def test_a_refit_leaves_materials_bit_for_bit(data, tmp_path, monkeypatch):
         states.append({k: v.clone() for k, v in scene.state_dict().items()})
 
     monkeypatch.setattr(train_task, "run_stage", watched)
-    train_task.train(plain_training(data, tmp_path / "run", stages, minutes=2.0, scene=sizes))
+    train_task.train(training(data, tmp_path, replace(STAGE, iterations=30), JOINT, refit))
     start, formed, before, after = states
     kept = {k for k in after if torch.equal(before[k], after[k])}
     assert "sky.log_radiance" in kept
@@ -472,10 +464,25 @@ def test_a_refit_leaves_materials_bit_for_bit(data, tmp_path, monkeypatch):
     assert not torch.equal(formed["sky.log_radiance"], before["sky.log_radiance"])
 
 
-def tint_(scene, tint: torch.Tensor) -> None:
-    """Give the mean of the map this colour [3]."""
-    mean = scene.sky.radiance.mean(0)
-    scene.sky.log_radiance.add_((tint * mean.mean() / mean).log())
+def levelled(albedo=None, tint=(1.0, 1.0, 1.0), metals=0, evidence=0.0):
+    """Albedo before and after `set_level_`, and the mean of the map after it: of a sphere of such a
+    median albedo under a map of such a colour, of which the first points are metal.
+
+    What photographs show, the product of map and albedo, stays."""
+    scene, problem = sphere_of((0.1, 0.1, 0.1), 0.5, 0.5)
+    features = scene.field.features_at(problem.observations.position)
+    with torch.no_grad():
+        if albedo is not None:
+            scene.material.shift_albedo(features, torch.full((3,), albedo))
+        mean = scene.sky.radiance.mean(0)
+        scene.sky.log_radiance.add_((torch.tensor(tint) * mean.mean() / mean).log())
+        before = scene.material(features)[0]
+        shown = scene.sky.radiance * before.median(0).values
+        joint_solve.set_level_(scene, problem, torch.arange(len(features)) < metals, evidence)
+        after = scene.material(features)[0]
+        product = scene.sky.radiance * after.median(0).values
+        torch.testing.assert_close(product, shown, rtol=1e-3, atol=0)
+        return before, after, scene.sky.radiance.mean(0)
 
 
 @pytest.mark.parametrize(
@@ -488,66 +495,27 @@ def tint_(scene, tint: torch.Tensor) -> None:
     ],
 )
 def test_the_level_of_light_and_albedo(metal, evidence, wanted, share):
-    """What photographs show, the product of map and albedo, stays; the map becomes white."""
-    scene, problem = sphere_of((0.1, 0.1, 0.1), 0.5, 0.5)
-    features = scene.field.features_at(problem.observations.position)
+    """The map becomes white as far as the level is not told."""
     tint = torch.tensor([1.3, 1.0, 0.7])
-    with torch.no_grad():
-        scene.material.shift_albedo(features, torch.full((3,), 0.1))
-        tint_(scene, tint)
-        before = scene.material(features)[0] * tint**share
-        shown = scene.sky.radiance * scene.material(features)[0].median(0).values
-        every = torch.full((len(features),), metal)
-        joint_solve.set_level_(scene, problem, every, evidence)
-        albedo = scene.material(features)[0]
-    torch.testing.assert_close(scene.sky.radiance * albedo.median(0).values, shown)
-    left = scene.sky.radiance.mean(0)
-    torch.testing.assert_close(
-        left / left.mean(), tint ** (1 - share) / (tint ** (1 - share)).mean()
-    )
+    before, albedo, left = levelled(0.1, tint.tolist(), 10**6 * metal, evidence)
+    before, kept = before * tint**share, tint ** (1 - share)
+    torch.testing.assert_close(left / left.mean(), kept / kept.mean())
     level = before.mean(0).max() if metal else luminance(before).mean()
     expected = before.mean(0) * (wanted / level) ** share
     torch.testing.assert_close(albedo.mean(0), expected, rtol=0.01, atol=0)
 
 
-def test_bright_albedo_stays():
-    scene, problem = sphere_of((0.1, 0.1, 0.1), 0.5, 0.5)
-    features = scene.field.features_at(problem.observations.position)
-    with torch.no_grad():
-        tint_(scene, torch.ones(3))
-        before = scene.material(features)[0]
-        joint_solve.set_level_(scene, problem, torch.zeros(len(features), dtype=torch.bool), 0.0)
-        assert before.mean() > joint_solve.ORDINARY
-        torch.testing.assert_close(scene.material(features)[0], before)
-
-
-def test_a_bright_albedo_under_coloured_light_keeps_its_contrast():
-    """Where the light's colour would make it brighter than white paint, both stay darker."""
-    scene, problem = sphere_of((0.1, 0.1, 0.1), 0.5, 0.5)
-    features = scene.field.features_at(problem.observations.position)
-    with torch.no_grad():
-        scene.material.shift_albedo(features, torch.full((3,), 0.85))
-        tint_(scene, torch.tensor([1.4, 0.95, 0.65]))
-        before = scene.sky.radiance * scene.material(features)[0].median(0).values
-        nothing = torch.zeros(len(features), dtype=torch.bool)
-        joint_solve.set_level_(scene, problem, nothing, 0.0)
-        median = scene.material(features)[0].median(0).values
-    assert median.max() < joint_solve.WHITE + 0.01
-    torch.testing.assert_close(scene.sky.radiance * median, before, rtol=1e-3, atol=0)
-
-
-def test_metal_parts_bound_the_level(monkeypatch):
-    """They would come out brighter than any metal is."""
-    scene, problem = sphere_of((0.1, 0.1, 0.1), 0.5, 0.5)
-    features = scene.field.features_at(problem.observations.position)
-    with torch.no_grad():
-        scene.material.shift_albedo(features, torch.full((3,), 0.1))
-        tint_(scene, torch.ones(3))
-        monkeypatch.setattr(joint_solve, "ORDINARY_METAL", 0.15)
-        joint_solve.set_level_(scene, problem, torch.arange(len(features)) < 99, 0.0)
-        torch.testing.assert_close(
-            scene.material(features)[0].mean(), torch.tensor(0.15), rtol=0.01, atol=0
-        )
+def test_what_bounds_the_level(monkeypatch):
+    """Bright albedo stays; where the colour of light would make it brighter than white paint, both
+    stay darker; and metal parts would come out brighter than any metal is."""
+    before, after, _ = levelled()
+    assert before.mean() > joint_solve.ORDINARY
+    torch.testing.assert_close(after, before)
+    _, after, _ = levelled(0.85, (1.4, 0.95, 0.65))
+    assert after.median(0).values.max() < joint_solve.WHITE + 0.01
+    monkeypatch.setattr(joint_solve, "ORDINARY_METAL", 0.15)
+    _, after, _ = levelled(0.1, metals=99)
+    torch.testing.assert_close(after.mean(), torch.tensor(0.15), rtol=0.01, atol=0)
 
 
 def test_highlights_tell_the_level_and_roughness_hides_it():

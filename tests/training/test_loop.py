@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from analytic import write_scene
-from check_op import same_on_threads
+from op_cases import same_on_threads
 from plain import plain_stage, plain_training, small_scene
 
 from univoxel.cli.trainer import train

@@ -8,7 +8,6 @@ from unittest.mock import Mock
 import pytest
 import torch
 from analytic import scene_of
-from fine_map import fine_map, of_nodes
 from observed_points import photographed, problem_on_a_sphere
 from torch.nn.functional import normalize
 
@@ -18,6 +17,25 @@ from univoxel.config import JointConfig
 from univoxel.lights.views import Turntable
 from univoxel.render.observations import Mirrors
 from univoxel.training import joint_solve, mirrors
+
+
+def fine_map(direction):
+    """Radiance [..., 3] from directions [..., 3], and lamps."""
+    x, y, z = direction.unbind(-1)
+    pattern = 0.4 * (1.2 * (7 * x).sin() * (6 * y + 1).sin() + 1.2 * (7 * z + 2).sin()).exp()
+    tint = torch.stack([0.5 + 0.2 * x, 0.5 + 0.2 * y, 0.5 - 0.2 * z], -1)
+    return pattern[..., None] * tint
+
+
+def of_nodes(map, direction):
+    """Means [D, 3] of a map around nodes [D, 3]."""
+    nodes = torch.zeros(len(direction), 3)
+    texels = sphere.latlong_directions(64).flatten(0, 1)
+    nearest = (texels @ direction.T).argmax(1)
+    area = sphere.texel_solid_angles(64, 128).reshape(-1, 1)
+    nodes.index_add_(0, nearest, map(texels) * area)
+    return nodes / torch.zeros(len(direction), 1).index_add(0, nearest, area)
+
 
 POINTS, VIEWS, NODES = 1500, 16, 512
 BASE = torch.tensor([0.9, 0.7, 0.5])
@@ -89,15 +107,13 @@ def test_how_much_a_point_changes_tells_and_not_what_it_mirrors():
     assert found.sharp.float().mean() > 0.97
 
 
-def test_points_that_hardly_change_are_paint(monkeypatch):
-    """However little the map changes: 8 bits are noisy."""
+def test_what_changes_too_little_is_paint(monkeypatch):
+    """However little the map changes, for 8 bits are noisy; and lacquer changes less than what it
+    mirrors."""
     scene, problem = under_fine_map(lambda n: n[:, 2] > -2, white)
-    monkeypatch.setattr(mirrors, "CHANGE", 0.5)
-    assert mirrors.find_mirrors(scene, problem) is None
-
-
-def test_lacquer_changes_less_than_what_it_mirrors(monkeypatch):
-    scene, problem = under_fine_map(lambda n: n[:, 2] > -2, white)
+    with monkeypatch.context() as patch:
+        patch.setattr(mirrors, "CHANGE", 0.5)
+        assert mirrors.find_mirrors(scene, problem) is None
     lacquer = 0.3 + 0.35 * problem.observations.color
     problem = replace(problem, observations=replace(problem.observations, color=lacquer))
     assert mirrors.find_mirrors(scene, problem) is None
@@ -150,13 +166,9 @@ def test_fewer_than_half_of_the_voters_are_not_asked(monkeypatch):
         assert (10 in [call.args[1] for call in neighbours.call_args_list]) == voted
 
 
-def test_light_that_turns_has_no_common_map():
+def test_light_that_turns_and_too_few_points_say_nothing(monkeypatch):
     scene, problem = under_fine_map(lambda n: n[:, 2] > 0, white)
     assert mirrors.find_mirrors(scene, replace(problem, turned=Turntable)) is None
-
-
-def test_too_few_points_say_nothing(monkeypatch):
-    scene, problem = under_fine_map(lambda n: n[:, 2] > 0, white)
     monkeypatch.setattr(mirrors, "NEIGHBOURS", POINTS + 1)
     assert mirrors.find_mirrors(scene, problem) is None
 
@@ -240,16 +252,6 @@ def test_a_mirror_is_as_bright_where_it_mirrors_nothing_dark():
     rough = torch.zeros(8, dtype=torch.bool)
     as_seen = mirrors.reflectance(seen, map, everywhere, rough, nearest)
     assert torch.allclose(as_seen, color, rtol=1e-4)
-
-
-def test_regions_are_what_neighbours_link():
-    inside = torch.tensor([True, True, False, True, True])
-    nearest = torch.tensor([[0, 1], [1, 2], [2, 3], [3, 4], [4, 3]])
-    region, count = mirrors.regions_of(inside, nearest)
-    assert count == 3
-    assert region[0] == region[1]
-    assert region[3] == region[4]
-    assert len({int(region[i]) for i in (0, 2, 3)}) == 3
 
 
 def test_what_is_rough_mirrors_but_is_not_sharp():

@@ -125,20 +125,12 @@ def test_newton_in_no_time_takes_few_points(monkeypatch):
     assert [len(call.args[0].diffuse) for call in equations.call_args_list] == [20] * parts
 
 
-def test_no_steps_of_newton_leave_the_map():
+@pytest.mark.parametrize(("views", "steps"), [(8, 0), (1, 6)])
+def test_without_steps_or_rich_points_newton_leaves_the_map(views, steps):
+    """Of one observation the albedo explains everything."""
     scene = scene_of((0.5, 0.5, 0.5), 0.4, 32)
-    problem = problem_on_a_sphere(20, 8, 32, scene)
-    cfg = replace(CFG, newton_steps=0)
+    problem, cfg = problem_on_a_sphere(20, views, 32, scene), replace(CFG, newton_steps=steps)
     assert newton_round_(scene, problem, no_metal(problem), cfg, seconds=10.0) == NewtonRound()
-    assert (scene.sky.log_radiance == 0).all()
-
-
-def test_newton_without_rich_points_leaves_the_map():
-    scene = scene_of((0.5, 0.5, 0.5), 0.4, 32)
-    problem = problem_on_a_sphere(
-        20, 1, 32, scene
-    )  # of one observation the albedo explains everything
-    assert newton_round_(scene, problem, no_metal(problem), CFG) == NewtonRound()
     assert (scene.sky.log_radiance == 0).all()
 
 

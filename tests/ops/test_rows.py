@@ -1,49 +1,63 @@
-"""Smoothing at chosen nodes."""
+"""Rows of tables and nodes of grids: Adam on some of them, sums of gradients, smoothing."""
 
 import dataclasses
 
 import pytest
 import torch
 from bricks import cut
-from check_op import same_on_threads
+from op_cases import lists
 
 from univoxel.ops import (
+    adam_rows_,
     diffuse_rows_,
     diffuse_rows_reference_,
     smooth_rows_,
     smooth_rows_reference_,
+    sum_rows,
+    sum_rows_reference,
 )
 
 
+@pytest.mark.parametrize(("lr", "eps"), [(0.1, 1.0), (0.1, 0.0), (0.0, 1.0)])
+def test_first_step_of_adam_in_closed_form(lr, eps):
+    """From zero moments the corrected ones are g and g^2: the step is lr g / (|g| + eps)."""
+    param, grad = torch.zeros(3, 1).double(), torch.tensor([[4.0], [-2.0]]).double()
+    moments, rows = torch.zeros(2, 3, 1).double(), torch.tensor([2, 0])
+    numbers = {"lr": lr, "beta1": 0.9, "beta2": 0.99, "eps": eps, "step": 1}
+    adam_rows_(param, *moments.unbind(), rows, grad, **numbers)
+    assert param[:, 0].tolist() == pytest.approx([lr * 2 / (2 + eps), 0.0, -lr * 4 / (4 + eps)])
+
+
+def test_a_sum_of_rows_is_that_of_sparse_tensors():
+    given = lists(1, (100_003,), (0.03, 0.5))
+    parts = [
+        torch.sparse_coo_tensor(r[None], v, (100_003, 2), check_invariants=True)
+        for r, v in zip(given["rows"], given["values"], strict=True)
+    ]
+    whole = (parts[0] + parts[1]).coalesce()
+    row, total = sum_rows(**given)
+    assert torch.equal(row, whole.indices())
+    torch.testing.assert_close(total, whole.values())
+
+
+@pytest.mark.parametrize("row", [[5, 5], [5, 4], [-1, 3], [3, 10]])
+def test_the_reference_refuses_rows_that_do_not_ascend_in_the_table(row):
+    with pytest.raises(ValueError, match=r"rows must be in ascending order in \[0, 10\)"):
+        sum_rows_reference([torch.tensor(row)], [torch.ones(2, 3)], [10])
+
+
 @pytest.mark.parametrize("order", [1, 2])
-@pytest.mark.parametrize("shape", [(6, 5, 7, 3), (2, 1, 4, 1)])
-def test_native_equals_reference(order, shape):
-    grid = torch.randn(shape, dtype=torch.float64)
+def test_rows_come_in_any_order_and_others_stay(order):
+    grid = torch.randn(6, 5, 45, 3)
     nodes = grid[..., 0].numel()
     rows = torch.randperm(nodes)[: nodes // 2]
-    got = smooth_rows_(grid.clone(), rows, 0.3, order)
-    torch.testing.assert_close(got, smooth_rows_reference_(grid.clone(), rows, 0.3, order))
+    got, ordered = (smooth_rows_(grid.clone(), r, 0.3, order) for r in (rows, rows.sort().values))
+    assert torch.equal(got, ordered)
+    # 25 products of numbers of order 1 in float32
+    wanted = smooth_rows_reference_(grid.clone(), rows, 0.3, order)
+    torch.testing.assert_close(got, wanted, rtol=0, atol=2e-6)
     untouched = torch.ones(nodes, dtype=torch.bool).index_fill_(0, rows, False)
     assert torch.equal(got.view(nodes, -1)[untouched], grid.view(nodes, -1)[untouched])
-
-
-def smoothed_alike(grid, rows, *options):
-    """The smoothed grid: the same on any number of threads, of rows in any order."""
-    orders = iter([rows, rows, rows[torch.randperm(len(rows))]])
-    (found,) = same_on_threads(lambda: [smooth_rows_(grid.clone(), next(orders), 0.3, *options)])
-    return found
-
-
-@pytest.mark.parametrize("order", [1, 2])
-@pytest.mark.parametrize("channels", [1, 2, 12])
-def test_runs_of_rows_and_shuffled_rows_give_the_same_bits(order, channels):
-    # Runs longer than a tile of 16 numbers, up to the end of the grid; several chunks of rows.
-    grid = torch.randn(20, 15, 45, channels)
-    rows = torch.arange(grid[..., 0].numel())[3:]
-    found = smoothed_alike(grid, rows, order)
-    wanted = smooth_rows_reference_(grid.clone(), rows, 0.3, order)
-    # 25 products of numbers of order 1 in float32
-    torch.testing.assert_close(found, wanted, rtol=0, atol=2e-6)
 
 
 @pytest.mark.parametrize("order", [1, 2])
@@ -65,7 +79,9 @@ def test_a_sparse_grid_is_smoothed_as_the_dense_one(order, shape, channels):
         torch.testing.assert_close(found[node_rows], dense)
         untouched = torch.ones(len(pool), dtype=torch.bool).index_fill_(0, rows, False)
         assert torch.equal(found[untouched], pool[untouched])
-    smoothed_alike(pool, rows, order, bricks)
+    shuffled = rows[torch.randperm(len(rows))]
+    one, other = (smooth_rows_(pool.clone(), r, 0.3, order, bricks) for r in (rows, shuffled))
+    assert torch.equal(one, other)
 
 
 def test_thin_plate_keeps_a_plane_and_lowers_a_bump():
@@ -78,19 +94,6 @@ def test_thin_plate_keeps_a_plane_and_lowers_a_bump():
     # L L f at the bump is 1 + 6/36
     change = smooth_rows_(bump.clone(), middle, 0.4, 2)[4, 4, 4, 0] - bump[4, 4, 4, 0]
     assert change.item() == pytest.approx(-0.4 * (1 + 1 / 6), rel=1e-5)
-
-
-@pytest.mark.parametrize("shape", [(9, 8, 70), (2, 1, 4)])
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_diffusion_equals_reference(shape, dtype):
-    n = torch.Size(shape).numel()
-    rows = torch.randperm(n)[: n // 2].sort().values
-    values = torch.randn(len(rows), dtype=dtype)
-    found = [
-        op(values.clone(), rows, shape, 0.8, 3) for op in (diffuse_rows_, diffuse_rows_reference_)
-    ]
-    torch.testing.assert_close(*found)
-    assert not torch.equal(found[0], values)
 
 
 def test_diffusion_in_bricks_equals_that_in_the_dense_grid():

@@ -1,4 +1,4 @@
-"""Trainings whose numbers fail on purpose: they end finite and say what happened."""
+"""Trainings whose numbers fail on purpose, and those that gain nothing any more."""
 
 import dataclasses
 import json
@@ -10,18 +10,20 @@ from observed_points import Steps, no_metal, problem_on_a_sphere
 from plain import plain_stage, plain_training, small_scene
 
 from univoxel.cli import trainer as task
+from univoxel.cli.trainer import train
 from univoxel.config import JointConfig
+from univoxel.lights import SGConfig
 from univoxel.optim import RowAdam
-from univoxel.scene import load_scene
+from univoxel.scene import SceneConfig, load_checkpoint, load_scene
 from univoxel.training import descent, equations, joint_solve, loop, newton
 from univoxel.training import progress as progress_module
-from univoxel.training.descent import LIMIT, PROOF, Guard
+from univoxel.training.descent import CHECK, LIMIT, PROOF, WINDOW, Guard, Plateau
 
 
 def small(data, out):
     stage = plain_stage(voxels=0.008, iterations=24, share=0.5, rays=256)
     stages = (stage, dataclasses.replace(stage, physical_from=0.0))
-    return plain_training(data, out, stages, minutes=2.0, scene=small_scene())
+    return plain_training(data, out, stages, minutes=60.0, scene=small_scene())
 
 
 def events(out):
@@ -89,7 +91,6 @@ def test_a_failure_that_stays_ends_its_stage(data, tmp_path, monkeypatch):
 
 
 def test_nothing_but_failure_leaves_the_state_it_began_with(data, tmp_path, monkeypatch):
-    cfg = small(data, tmp_path / "run")
     original, states = task.run_stage, []
 
     def watched(scene, *rest):
@@ -99,7 +100,7 @@ def test_nothing_but_failure_leaves_the_state_it_began_with(data, tmp_path, monk
 
     monkeypatch.setattr(task, "run_stage", watched)
     failing(monkeypatch, loop, "losses_of", bad_loss, lambda i: True)
-    task.train(cfg)
+    task.train(small(data, tmp_path / "run"))
     for before, after in (states[:2], states[2:]):
         assert all(torch.equal(before[k], after[k]) for k in before)
 
@@ -212,23 +213,21 @@ def test_going_back_forgets_the_moments_and_says_so(followed):
     assert not optimizer.state
 
 
-def test_quality_of_another_kind_is_no_collapse(followed):
+@pytest.mark.parametrize(
+    ("sound", "collapsed", "told"),
+    [
+        # Of another kind of render; and what is beyond need
+        (((30.0, False), (15.0, True), (25.0, False)), 18.0, "18.0 dB (best: 25.0 dB)"),
+        ([(x, False) for x in (100.0, 41.0, 100.0, 36.0)], float("nan"), "nan dB (best: 40.0 dB)"),
+    ],
+)
+def test_quality_that_may_fall_and_that_may_not(followed, sound, collapsed, told):
     _, _, steps, watch = followed
-    watch.judge(30.0, False)
-    watch.judge(15.0, True)
-    watch.judge(25.0, False)
+    for look in sound:
+        watch.judge(*look)
     assert not steps.troubles
-    watch.judge(18.0, False)
-    assert "validation PSNR is 18.0 dB (best: 25.0 dB)" in steps.troubles[0]
-
-
-def test_quality_beyond_need_may_fall(followed):
-    _, _, steps, watch = followed
-    for psnr in (100.0, 41.0, 100.0, 36.0):
-        watch.judge(psnr, False)
-    assert not steps.troubles
-    watch.judge(float("nan"), False)
-    assert "validation PSNR is nan dB (best: 40.0 dB)" in steps.troubles[0]
+    watch.judge(collapsed, False)
+    assert f"validation PSNR is {told}" in steps.troubles[0]
 
 
 def test_a_copy_of_another_grid_is_not_taken(followed):
@@ -279,3 +278,43 @@ def test_a_newton_round_without_a_solution_leaves_the_map(monkeypatch):
     solved = newton.newton_round_(scene, problem, no_metal(problem), JOINT)
     assert solved == newton.NewtonRound(troubles=[newton.UNSOLVABLE])
     assert (scene.sky.log_radiance == 0).all()
+
+
+def looks(patience, quality, steps=1000, physical_from=0.0):
+    """Progress at the looks, and where the plateau was seen."""
+    plateau, when, flat = Plateau(patience), [], []
+    for i in range(steps):
+        done = i / steps
+        if plateau.due(done):
+            when.append(done)
+            if plateau.flat(done, quality(done), done >= physical_from):
+                flat.append(done)
+    return when, flat
+
+
+def test_where_there_is_no_plateau():
+    """Rising quality, another kind of render, which counts anew; and without patience."""
+    when, flat = looks(0.1, lambda done: 20 + 10 * done)
+    assert not flat
+    assert len(when) == pytest.approx(1 / CHECK, abs=1)
+    _, flat = looks(0.1, lambda done: 20 + 10 * done - 9 * (done > 0.5), physical_from=0.5)
+    assert not flat
+    assert looks(0.0, lambda done: 20.0) == ([], [])
+
+
+def test_a_plateau_is_seen_once_and_then_nothing_is_looked_at():
+    when, flat = looks(0.1, lambda done: 20 + 10 * min(done, 0.4))
+    assert flat == [when[-1]]
+    assert 0.4 < flat[0] <= 0.4 + (WINDOW + 1) * CHECK
+
+
+def test_a_training_that_gains_too_little_is_shortened(data, tmp_path):
+    light = SGConfig(lobes=2, hidden=8, directions=16, directions_eval=16)
+    stage = plain_stage(voxels=0.008, iterations=60, share=1.0, rays=128, physical_from=0.0)
+    sizes = SceneConfig(4, material_channels=2, hidden=8, sky_nodes=16, light=light)
+    cfg = plain_training(data, tmp_path / "run", (stage,), minutes=2.0, scene=sizes, patience=50.0)
+    state = load_checkpoint(train(cfg))[1]
+    assert state["early"] == [0]
+    assert state["made"][0] < 0.6
+    cfg = dataclasses.replace(cfg, patience=0.0, out=tmp_path / "whole")
+    assert load_checkpoint(train(cfg))[1]["made"] == [1.0]
