@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 from analytic import write_scene
-from tiny import tiny, tiny_copy  # noqa: F401
+from asymmetric_scene import lopsided, subject_of
+from tiny import plain, tiny, tiny_copy  # noqa: F401
 
 from univoxel.data import load_images
 
@@ -27,6 +28,18 @@ os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(_FOLDER))
 def data(tmp_path_factory):
     """A small data set of the sphere, which no test changes."""
     return write_scene(tmp_path_factory.mktemp("sphere") / "data", views=8, size=24)
+
+
+@pytest.fixture(scope="session")
+def balls():
+    """A scene without any symmetry, which no test changes."""
+    return lopsided()
+
+
+@pytest.fixture(scope="session")
+def subject():
+    """What the viewer shows of it where it is coarse."""
+    return subject_of(lopsided(24**3))
 
 
 @pytest.fixture
