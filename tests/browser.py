@@ -12,7 +12,6 @@ import subprocess
 import tempfile
 import time
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 from PIL import Image
@@ -132,18 +131,15 @@ class Tab:
 
     def swipe(self, start, end):
         """Drag with one finger."""
-        point = lambda at: [{"x": at[0], "y": at[1]}]  # noqa: E731
-        self.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=point(start))
-        for i in range(1, 9):
-            at = [a + (b - a) * i / 8 for a, b in zip(start, end, strict=True)]
-            self.call("Input.dispatchTouchEvent", type="touchMove", touchPoints=point(at))
+        for i in range(9):
+            kind = "touchMove" if i else "touchStart"
+            x, y = (a + (b - a) * i / 8 for a, b in zip(start, end, strict=True))
+            self.call("Input.dispatchTouchEvent", type=kind, touchPoints=[{"x": x, "y": y}])
         self.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
 
-    def screenshot(self, path=None):
-        """The window as [H, W, 3] bytes; also into a PNG file."""
+    def screenshot(self):
+        """The window as [H, W, 3] bytes."""
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
-        if path is not None:
-            Path(path).write_bytes(data)
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
 

@@ -10,7 +10,8 @@ import pytest
 import textured_room
 import torch
 from analytic import write_scene
-from tiny import tiny, tiny_copy  # noqa: F401
+from asymmetric_scene import lopsided, subject_of
+from tiny import plain, tiny, tiny_copy  # noqa: F401
 
 from univoxel.data import load_images
 from univoxel.preparation.stereo import depth_maps
@@ -36,6 +37,18 @@ def room():
     """Photographs of an object on a patterned floor, in a room with furniture, and depth maps."""
     photos = textured_room.photos_of(textured_room.orbit(30, 160, 120))
     return photos, depth_maps(photos)
+
+
+@pytest.fixture(scope="session")
+def balls():
+    """A scene without any symmetry, which no test changes."""
+    return lopsided()
+
+
+@pytest.fixture(scope="session")
+def subject():
+    """What the viewer shows of it where it is coarse."""
+    return subject_of(lopsided(24**3))
 
 
 @pytest.fixture

@@ -73,19 +73,11 @@ def write_nerf(folder: Path, scene: Scene) -> Path:
 
 def write_nerfstudio(folder: Path, scene: Scene, **root) -> Path:
     """Photographs without alpha and masks by mask_path; frames in no order."""
-    for place in ("images", "masks"):
-        (folder / place).mkdir(parents=True)
+    write_pictures(folder, scene, "images", "masks")
     frames = []
     for v, name in reversed(list(enumerate(scene.names))):
-        write_png(folder / "images" / f"{name}.png", scene.pictures[v, ..., :3])
-        write_png(folder / "masks" / f"{name}.png", scene.pictures[v, ..., 3])
-        frames.append(
-            {
-                "file_path": f"images/{name}.png",
-                "mask_path": f"masks/{name}.png",
-                "transform_matrix": scene.poses[v].tolist(),
-            }
-        )
+        files = {"file_path": f"images/{name}.png", "mask_path": f"masks/{name}.png"}
+        frames.append({**files, "transform_matrix": scene.poses[v].tolist()})
     height, width = scene.pictures.shape[1:3]
     camera = {"camera_model": "OPENCV", "fl_x": FOCAL, "fl_y": FOCAL, "w": width, "h": height}
     camera |= {"cx": width / 2, "cy": height / 2, "k1": 0.0, "p2": 0.0, "aabb_scale": 16}
@@ -103,23 +95,20 @@ def write_colmap(
     parameters: tuple[float, ...] = (FOCAL, WIDTH / 2, HEIGHT / 2),
 ) -> Path:
     """Photographs without alpha, masks by COLMAP's naming, images in no order."""
-    for part in ("images", "masks", place):
-        (folder / part).mkdir(parents=True, exist_ok=True)
+    write_pictures(folder, scene, "images", "masks", pad=".png")
+    (folder / place).mkdir(parents=True, exist_ok=True)
     height, width = scene.pictures.shape[1:3]
     rows = []
     for v, name in reversed(list(enumerate(scene.names))):
-        write_png(folder / "images" / f"{name}.png", scene.pictures[v, ..., :3])
-        write_png(folder / "masks" / f"{name}.png.png", scene.pictures[v, ..., 3])
         # x right, y down, z forward; from the world to the camera
         to_world = scene.poses[v, :3, :3] * [1, -1, -1]
         x, y, z, w = Rotation.from_matrix(to_world.T).as_quat()
         rows.append((v + 5, (w, x, y, z), -to_world.T @ scene.poses[v, :3, 3], f"{name}.png"))
     if text:
         numbers = " ".join(map(str, parameters))
-        (folder / place / "cameras.txt").write_text(
-            f"# Camera list\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
-            f"3 {model} {width} {height} {numbers}\n"
-        )
+        head = "# Camera list\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
+        camera = f"3 {model} {width} {height} {numbers}\n"
+        (folder / place / "cameras.txt").write_text(head + camera)
         lines = ["# Image list with two lines of data per image:"]
         for i, (number, q, t, name) in enumerate(rows):
             values = " ".join(repr(float(value)) for value in (*q, *t))
@@ -139,14 +128,10 @@ def write_colmap(
 
 def write_llff(folder: Path, scene: Scene, original: int = 1, place: str = "images") -> Path:
     """Photographs without alpha; rows that describe originals `original` times as large."""
-    masks = place.replace("images", "masks")
-    for part in (place, masks):
-        (folder / part).mkdir(parents=True)
+    write_pictures(folder, scene, place, place.replace("images", "masks"))
     height, width = scene.pictures.shape[1:3]
     rows = []
-    for pose, name, picture in zip(scene.poses, scene.names, scene.pictures, strict=True):
-        write_png(folder / place / f"{name}.png", picture[..., :3])
-        write_png(folder / masks / f"{name}.png", picture[..., 3])
+    for pose in scene.poses:
         right, up, back, position = pose[:3].T
         size_and_focal = original * np.array([height, width, FOCAL])
         camera = np.stack([-up, right, back, position, size_and_focal], 1)
@@ -164,7 +149,7 @@ def to_camera(pose: np.ndarray) -> np.ndarray:
 
 def write_pictures(folder: Path, scene: Scene, images: str, masks: str, pad: str = "") -> None:
     for place in (images, masks):
-        (folder / place).mkdir(parents=True)
+        (folder / place).mkdir(parents=True, exist_ok=True)
     for name, picture in zip(scene.names, scene.pictures, strict=True):
         write_png(folder / images / f"{name}.png", picture[..., :3])
         write_png(folder / masks / f"{name}{pad}.png", picture[..., 3])
@@ -289,12 +274,8 @@ def write_tensoir(folder: Path, scene: Scene) -> Path:
             view = folder / f"{split}_{i:03d}"
             view.mkdir(parents=True)
             write_png(view / "rgba_sunset.png", scene.pictures[v])
-            meta = {
-                "cam_angle_x": angle(),
-                "cam_transform_mat": ",".join(str(x) for x in scene.poses[v].ravel()),
-                "imh": HEIGHT,
-                "imw": WIDTH,
-            }
+            meta = {"cam_angle_x": angle(), "imh": HEIGHT, "imw": WIDTH}
+            meta["cam_transform_mat"] = ",".join(str(x) for x in scene.poses[v].ravel())
             (view / "metadata.json").write_text(json.dumps(meta))
     return folder
 
@@ -306,8 +287,11 @@ def save_turned(path: Path, picture: np.ndarray, tag: int) -> None:
     Image.fromarray(picture).save(path, exif=exif, quality=100, subsampling=0)
 
 
-def replaced(file: str, *changes: tuple[str, str]) -> Callable[[Path], None]:
-    """Damage to a text file of a folder: pieces, each by another."""
+Damage = Callable[[Path], object]  # to a data set in a folder
+
+
+def replaced(file: str, *changes: tuple[str, str]) -> Damage:
+    """Pieces of a text file, each by another."""
 
     def apply(folder: Path) -> None:
         text = (folder / file).read_text()
@@ -319,8 +303,8 @@ def replaced(file: str, *changes: tuple[str, str]) -> Callable[[Path], None]:
     return apply
 
 
-def edited(file: str, change: Callable[[Any], object]) -> Callable[[Path], None]:
-    """Damage to a JSON file of a folder."""
+def edited(file: str, change: Callable[[Any], object]) -> Damage:
+    """A change of what a JSON file holds."""
 
     def apply(folder: Path) -> None:
         root = json.loads((folder / file).read_text())
@@ -330,7 +314,23 @@ def edited(file: str, change: Callable[[Any], object]) -> Callable[[Path], None]
     return apply
 
 
-def refused(folder: Path, damage: Callable[[Path], object], message: str, split="train") -> None:
+def rewritten(file: str, content: bytes) -> Damage:
+    return lambda folder: (folder / file).write_bytes(content)
+
+
+def renamed(old: str, new: str) -> Damage:
+    return lambda folder: (folder / old).rename(folder / new)
+
+
+def without(*files: str) -> Damage:
+    return lambda folder: [(folder / file).unlink() for file in files]
+
+
+def repainted(file: str, picture: np.ndarray) -> Damage:
+    return lambda folder: write_png(folder / file, picture)
+
+
+def refused(folder: Path, damage: Damage, message: str, split: str = "train") -> None:
     """A data set that is sound can be read; damaged, one line says where, and what."""
     load_photos(folder, split)
     damage(folder)

@@ -22,16 +22,15 @@ from univoxel import cli, errors
 from univoxel.capture.config import DEFAULTS, FAST
 from univoxel.cli import COMMANDS, LABORATORY, SPINS, laboratory, main, take_threads
 from univoxel.cli.capture import CaptureOptions
-from univoxel.cli.parsing import meanings, takes
+from univoxel.cli.parsing import meanings
 from univoxel.config import save_config
 from univoxel.errors import ExistingFile, MissingExtra, MissingFile, ProcessFailed, UserError
 from univoxel.presets import chosen
 
-# What a command calls, by the module that holds it; and commands that do all themselves
+# What a command calls, by the module that holds it, if that is none of its own
 WORK = {"train": "univoxel.cli.trainer", "poses": "univoxel.capture.poses"}
 WORK |= {"cutout": "univoxel.capture.cutout"}
 USUAL = {"network": "u2netp", "box": None, "keep_table": False}  # of how masks are made
-ALONE = ("demo", "export", "inspect", "view")
 KINDS = [k for k in vars(errors).values() if isinstance(k, type) and issubclass(k, UserError)]
 
 
@@ -50,13 +49,8 @@ def calls(monkeypatch):
         return call
 
     def replace(name, result=None, **others):
-        """In place of what a command calls, or of what it does itself."""
-        if name in ALONE:
-            command = takes(COMMANDS[name].record)(task(name, result))
-            monkeypatch.setitem(COMMANDS, name, command)
-        else:
-            module = WORK.get(name, f"univoxel.cli.{name}")
-            give(module, **{name: task(name, result)}, **others)
+        module = WORK.get(name, f"univoxel.cli.{name}")
+        give(module, **{name: task(name, result)}, **others)
 
     def give(module, **functions):
         for name, function in functions.items():
@@ -75,13 +69,9 @@ def calls(monkeypatch):
     replace("cutout", Path("cut"))
     replace("evaluate", {"psnr": 31.25, "views": 5}, table=as_table)
     give("univoxel.cli.relight", relight_to_files=task("relight"))
-    replace("export", [Path("out.ply"), Path("out_lod1.ply")])
     replace("envmap", None)
     found = {"chosen": [{"said": "lobes 24 -> 12"}]}
     replace("info", found, tables=lambda found: ["parts", "sizes"])
-    replace("demo", Path("demo/index.html"))
-    replace("view", Path("mug.html"))
-    replace("inspect", Path("light.png"))
     return types.SimpleNamespace(noted=noted, replace=replace, give=give, task=task)
 
 
@@ -109,6 +99,77 @@ def test_train_passes_the_preset_and_the_changes_on(calls, tmp_path, capsys):
     assert calls.noted == [
         ("train", (expected,), {"resume": False, "timelapse": None, "view": None})
     ]
+
+
+PHOTOS, RUN, OUT, CUP = map(Path, ("photos", "run", "out", "cup"))
+LAB = {"compare": "lab.compare", "chart": "lab.chart", "stress": "lab.stress.suite"}
+FILM = {"keep_size": 900, "keep_weak": True, "config": replace_fields(FAST, size=800, seed=3)}
+OF_FILM = "--masks m --every 0.5 --keep-size 900 --keep-weak --fast --size 800 --seed 3"
+MEASURED = {"run": RUN, "data": PHOTOS, "save": Path("dir"), "json": Path("m.json"), "samples": 8}
+MEASURED |= {"bounces": 0, "test_every": 16, "background": "white", "fit_light": True}
+TO_MEASURE = "--data photos --save dir --json m.json --samples 8 --bounces 0 --test-every 16"
+LOOKED_AT = {"json": Path("a.json"), "picture": Path("b.png")}
+TWO_MAPS = RUN, (Path("a.exr"), Path("b.exr")), Path("run/relight")
+SUITE = OUT, ("sun", "dark"), ("sg", "sh"), 2, True, ("loss.radiance=2",)
+COMPARED = (CUP, Path("shoe")), OUT, "draft", ("sg", "sg:lobes=12"), 2.0, ("seed=1",), 4
+# Lines, and what they call it with, by place and by name
+PASSED = [
+    ("poses photos --out out", (PHOTOS, OUT, None, None), {"keep_size": 2000, "config": DEFAULTS}),
+    (f"poses film.mp4 --out out {OF_FILM}", (Path("film.mp4"), OUT, Path("m"), 0.5), FILM),
+    ("cutout photos --out out --downscale 2", (PHOTOS, OUT, "rembg", 2, False), USUAL),
+    ("cutout photos --out out --from masks", (PHOTOS, OUT, "masks", 0, False), USUAL),
+    ("info run --json a.json --picture b.png", (RUN,), LOOKED_AT),
+    (f"eval run {TO_MEASURE} --background white --fit-light --full-size", (), MEASURED),
+    ("relight run --envmap a.exr b.exr --orbit 3", TWO_MAPS, {"cameras": "orbit 3"}),
+    (
+        "relight run --envmap maps/hall.exr --rotate 90",
+        *((RUN, Path("maps/hall.exr"), Path("run/relight/hall")), {"rotate": 90.0}),
+    ),
+    ("envmap run --out out --height 32 --light-of 2", (), {"height": 32, "light_of": "2"}),
+    (
+        "lab compare cup shoe --out out --preset draft --samples 4 --set seed=1 "
+        "--light sg sg:lobes=12 --minutes 2",
+        *(COMPARED, {}),
+    ),
+    (
+        "chart cup --out out --samples 4 --set seed=1 --light sg --quick --only draft",
+        *(((CUP,), OUT, "fast", "sg", True, ("draft",), ("seed=1",), 4, 1), {}),
+    ),
+    (
+        "stress --out out --quick --only sun dark --light sg sh --seeds 2 --set loss.radiance=2",
+        *(SUITE, {"jobs": 1, "scheduler": None}),
+    ),
+    ("lab stress --out out", (OUT, (), (), None, False, ()), {}),
+]
+
+
+@pytest.mark.parametrize(("line", "given", "named"), PASSED, ids=[row[0] for row in PASSED])
+def test_options_reach_the_work(calls, capsys, line, given, named):
+    for name, module in LAB.items():
+        calls.give(module, **{name: calls.task(name, "done")})
+    assert main(line.split()) == 0
+    ((_, found, options),) = calls.noted
+    assert found == given
+    assert {key: options[key] for key in named} == named
+    assert capsys.readouterr().out
+
+
+def test_maps_are_compared_where_the_truth_is_known(calls, capsys):
+    found = types.SimpleNamespace(ball_psnr=31.24, brightest_degrees=4.0, mirror_psnr=18.06)
+    calls.replace("envmap", found)
+    assert main(["envmap", "run", "--out", "map.exr"]) == 0
+    _, ball, mirror, brightest = capsys.readouterr().out.splitlines()
+    assert "31.2 dB" in ball
+    assert "18.1 dB" in mirror
+    assert "4.0 degrees" in brightest
+
+
+def test_experiments_that_cannot_begin_or_are_interrupted(calls, capsys):
+    assert main(["compare", "cup", "--out", "out", "--minutes", "-1"]) == 2
+    assert "--minutes must be above 0, got -1" in capsys.readouterr().err
+    calls.give("lab.chart", chart=calls.task("chart", KeyboardInterrupt()))
+    assert main(["chart", "cup", "--out", "out"]) == 130
+    assert "finished runs are in out" in capsys.readouterr().err
 
 
 def test_capture_until_a_step(calls, capsys):
@@ -163,52 +224,6 @@ def test_train_as_another_run_was_trained(calls, tmp_path, capsys):
     assert "none.json: expected a configuration" in capsys.readouterr().err
 
 
-def test_poses(calls, capsys):
-    assert main(["poses", "photos", "--out", "scene"]) == 0
-    options = ["--masks", "m", "--every", "0.5", "--keep-size", "900", "--keep-weak", "--fast"]
-    more = ["--size", "800", "--seed", "3"]
-    assert main(["poses", "film.mp4", "--out", "scene", *options, *more]) == 0
-    fast = replace_fields(FAST, size=800, seed=3)
-    out = Path("scene")
-    usual = {"keep_size": 2000, "keep_weak": False, "config": DEFAULTS}
-    asked = {"keep_size": 900, "keep_weak": True, "config": fast}
-    assert calls.noted == [
-        ("poses", (Path("photos"), out, None, None), usual),
-        ("poses", (Path("film.mp4"), out, Path("m"), 0.5), asked),
-    ]
-    assert capsys.readouterr().out == "scene\nscene\n"
-
-
-@pytest.mark.parametrize(
-    "option", [("--keep-size", "-1"), ("--every", "0"), ("--size", "10"), ("--features", "0")]
-)
-def test_sizes_of_poses_out_of_range(calls, capsys, option):
-    assert main(["poses", "photos", "--out", "scene", *option]) == 2
-    assert option[0].removeprefix("--").replace("-", "_") in capsys.readouterr().err.replace(
-        "-", "_"
-    )
-    assert calls.noted == []
-
-
-def test_cutout(calls, capsys):
-    assert main(["cutout", "photos", "--out", "cut", "--downscale", "2"]) == 0
-    assert main(["cutout", "photos", "--out", "cut", "--from", "masks"]) == 0
-    where = Path("photos"), Path("cut")
-    assert calls.noted == [
-        ("cutout", (*where, "rembg", 2, False), USUAL),
-        ("cutout", (*where, "masks", 0, False), USUAL),
-    ]
-    assert capsys.readouterr().out == "cut\ncut\n"
-
-
-@pytest.mark.parametrize("command", ["train", "cutout"])
-@pytest.mark.parametrize("factor", ["0", "-2"])
-def test_downscale_out_of_range(calls, tmp_path, capsys, command, factor):
-    assert main([command, "photos", "--out", str(tmp_path / "run"), "--downscale", factor]) == 2
-    assert f"--downscale must be at least 1, got {factor}" in capsys.readouterr().err
-    assert not calls.noted
-
-
 def of_stage(number, name):
     return lambda config: getattr(config.stages[number], name)
 
@@ -231,13 +246,6 @@ def test_what_options_make_of_the_configuration(calls, tmp_path, options, of, ex
     assert of(calls.noted[0][1][0]) == expected
 
 
-def test_info(calls, capsys):
-    assert main(["info", "run", "--json", "a.json", "--picture", "b.png"]) == 0
-    expected = {"json": Path("a.json"), "picture": Path("b.png")}
-    assert calls.noted == [("info", (Path("run"),), expected)]
-    assert capsys.readouterr().out == "parts\nsizes\nlobes 24 -> 12\n"
-
-
 def test_train_does_not_overwrite_a_run(calls, tmp_path, capsys):
     (tmp_path / "scene.safetensors").touch()
     assert main(["train", "photos", "--out", str(tmp_path)]) == 2
@@ -247,109 +255,6 @@ def test_train_does_not_overwrite_a_run(calls, tmp_path, capsys):
     film = ["--timelapse", "frames/"]
     assert main(["train", "photos", "--out", str(tmp_path), "--resume", *film]) == 0
     assert calls.noted[1][2] == {"resume": True, "timelapse": "frames/", "view": None}
-
-
-def test_eval(calls, capsys):
-    options = ["--samples", "8", "--bounces", "0", "--test-every", "16"]
-    options += ["--background", "white", "--fit-light", "--full-size"]
-    paths = {"data": Path("photos"), "save": Path("dir"), "json": Path("m.json")}
-    named = [str(part) for name, path in paths.items() for part in (f"--{name}", path)]
-    assert main(["eval", "run", *named, *options]) == 0
-    assert main(["eval", "run"]) == 0
-    default = {"data": None, "save": None, "json": None, "samples": 64, "bounces": 2}
-    run = {"run": Path("run")}
-    protocol = {"test_every": 16, "background": "white", "fit_light": True}
-    protocol |= {"full_size": True}
-    default |= {"light_of": None, "test_every": None, "background": "black", "fit_light": False}
-    default |= {"full_size": False}
-    assert "table of {'psnr': 31.25, 'views': 5}" in capsys.readouterr().out
-    assert calls.noted == [
-        ("evaluate", (), run | paths | {"samples": 8, "bounces": 0, "light_of": None} | protocol),
-        ("evaluate", (), run | default),
-    ]
-
-
-def test_relight_export_view_and_demo(calls, capsys):
-    assert main(["relight", "run", "--envmap", "maps/hall.exr", "--rotate", "90"]) == 0
-    placed = ["--size", "0.3", "--origin", "bottom", "--lods", "1", "--texture-format", "jpeg"]
-    assert main(["export", "run", "--mesh", "out.ply"]) == 0
-    assert main(["export", "run", "--mesh", "out.ply", *placed, "--quality", "80"]) == 0
-    assert main(["view", "run", "--html", "mug.html", "--envmap", "maps/hall.exr"]) == 0
-    assert main(["demo", "--out", "demo"]) == 0
-    paths = (Path("run"), Path("maps/hall.exr"), Path("run/relight/hall"))
-    options = {"faces": None, "texture_size": None, "watertight": False, "texture_format": "png"}
-    options |= {"quality": 90, "size": None, "origin": "upright", "lods": 0}
-    chosen_options = {"texture_format": "jpeg", "quality": 80}
-    chosen_options |= {"size": 0.3, "origin": "bottom", "lods": 1}
-    served = {"title": None, "host": "127.0.0.1", "port": 8080}
-    (name, given, relit), *others = calls.noted
-    assert (name, given, relit["cameras"], relit["rotate"]) == ("relight", paths, "test", 90.0)
-    run, mesh = {"run": Path("run")}, {"mesh": Path("out.ply")}
-    assert [(name, vars(asked)) for name, (asked,), _ in others] == [
-        ("export", run | mesh | options),
-        ("export", run | mesh | options | chosen_options),
-        ("view", run | {"html": Path("mug.html"), "envmap": (paths[1],)} | served),
-        ("demo", {"out": Path("demo")}),
-    ]
-    printed = capsys.readouterr().out.split()
-    levels = ["out.ply", "out_lod1.ply"]
-    assert printed == ["run/relight/hall", *levels, *levels, "mug.html", "demo/index.html"]
-
-
-def test_envmap(calls, capsys):
-    assert main(["envmap", "run", "--out", "map.exr"]) == 0
-    options = {"height": 128, "light_of": None}
-    assert calls.noted == [("envmap", (), {"run": Path("run"), "out": Path("map.exr")} | options)]
-    assert capsys.readouterr().out == "map.exr\n"
-    found = types.SimpleNamespace(ball_psnr=31.24, brightest_degrees=4.0, mirror_psnr=18.06)
-    calls.replace("envmap", found)
-    assert main(["envmap", "run", "--out", "map.exr", "--height", "32", "--light-of", "2"]) == 0
-    assert calls.noted[-1][2] | {"height": 32, "light_of": "2"} == calls.noted[-1][2]
-    _, ball, mirror, brightest = capsys.readouterr().out.splitlines()
-    assert "31.2 dB" in ball
-    assert "18.1 dB" in mirror
-    assert "4.0 degrees" in brightest
-
-
-def test_inspect(calls, tmp_path, capsys):
-    out = tmp_path / "light.png"
-    calls.replace("inspect", out)
-    assert main(["inspect", "run", "--view", "r_1", "--pixel", "3,4", "--out", str(out)]) == 0
-    ((_, (asked,), _),) = calls.noted
-    assert (asked.run, asked.view, asked.pixel, asked.out) == (Path("run"), "r_1", "3,4", out)
-    assert capsys.readouterr().out == f"{out}\n"
-
-
-def test_experiments(calls, tmp_path, capsys):
-    calls.give("lab.compare", compare=calls.task("compare", "table"))
-    calls.give("lab.chart", chart=calls.task("chart", "picture"))
-    options = ["--preset", "draft", "--samples", "4", "--set", "seed=1"]
-    more = ["--light", "sg", "sg:lobes=12", "--minutes", "2"]
-    assert main(["compare", "cup", "shoe", "--out", "out", *options, *more]) == 0
-    assert main(["chart", "cup", "--out", "out", *options, "--light", "sg", "--quick"]) == 0
-    assert main(["chart", "cup", "--out", "out", "--only", "draft", "fast"]) == 0
-    lights = ("sg", "sg:lobes=12")
-    scenes = (Path("cup"), Path("shoe"))
-    assert [given for _, given, _ in calls.noted] == [
-        (scenes, Path("out"), "draft", lights, 2.0, ("seed=1",), 4),
-        ((Path("cup"),), Path("out"), "draft", "sg", True, (), ("seed=1",), 4, 1),
-        ((Path("cup"),), Path("out"), "fast", "hybrid", False, ("draft", "fast"), (), 64, 1),
-    ]
-    assert capsys.readouterr().out.split() == ["table", "picture", "picture"]
-    calls.give("lab.stress.suite", stress=calls.task("stress", "breaks"))
-    options = ["--quick", "--only", "sun", "dark", "--light", "sg", "sh", "--seeds", "2"]
-    assert main(["stress", "--out", "out", *options, "--set", "loss.radiance=2"]) == 0
-    assert calls.noted[-1][1] == (
-        *(Path("out"), ("sun", "dark"), ("sg", "sh"), 2, True, ("loss.radiance=2",)),
-    )
-    assert main(["stress", "--out", "out"]) == 0
-    assert calls.noted[-1][1] == (Path("out"), (), (), None, False, ())
-    capsys.readouterr()
-    assert main(["compare", "cup", "--out", "out", "--minutes", "-1"]) == 2
-    assert "--minutes must be above 0, got -1" in capsys.readouterr().err
-    calls.give("lab.chart", chart=calls.task("chart", KeyboardInterrupt()))
-    assert main(["chart", "cup", "--out", "out"]) == 130
-    assert "finished runs are in out" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -439,6 +344,24 @@ def test_output_that_nobody_reads_to_its_end(arguments):
 
 
 @pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("poses --keep-size -1", "--keep-size must be at least 0, got -1"),
+        ("poses --every 0", "--every must be above 0, got 0"),
+        ("poses --size 10", "CaptureConfig: size must be "),
+        ("poses --features 0", "CaptureConfig: features must be "),
+        ("cutout --downscale 0", "--downscale must be at least 1, got 0"),
+        ("train --downscale -2", "--downscale must be at least 1, got -2"),
+    ],
+)
+def test_numbers_out_of_range(calls, capsys, line, message):
+    command, *options = line.split()
+    assert main([command, "photos", "--out", "out", *options]) == 2
+    assert capsys.readouterr().err.startswith(f"univoxel {command}: {message}")
+    assert not calls.noted
+
+
+@pytest.mark.parametrize(
     ("options", "message"),
     [
         (["--minutes", "0"], "--minutes must be above 0, got 0"),
@@ -505,15 +428,12 @@ def test_help_is_one_screen_in_the_order_of_work(capsys, arguments):
     assert all(line.strip() != line.split()[0] for line in lines[2:-1])  # each says what it does
 
 
-def test_the_laboratory_has_a_screen_of_its_own(capsys):
+@pytest.mark.parametrize("arguments", [["lab"], ["lab", "chart", "--help"], ["chart", "cup"]])
+def test_without_a_clone_there_is_no_laboratory(calls, monkeypatch, tmp_path, capsys, arguments):
     assert main(["lab"]) == 0
     named = [line.split()[0] for line in capsys.readouterr().out.splitlines()[2:-1]]
     assert named == list(LABORATORY) == list(laboratory())
     assert not set(named) & set(COMMANDS)
-
-
-@pytest.mark.parametrize("arguments", [["lab"], ["lab", "chart", "--help"], ["chart", "cup"]])
-def test_without_a_clone_there_is_no_laboratory(calls, monkeypatch, tmp_path, capsys, arguments):
     monkeypatch.setattr(cli, "CLONE", tmp_path)
     assert main(arguments) == 2
     out, err = capsys.readouterr()
@@ -522,14 +442,6 @@ def test_without_a_clone_there_is_no_laboratory(calls, monkeypatch, tmp_path, ca
     assert not out
     assert main(["completion", "bash"]) == 0
     assert "stress" not in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("word", [["lab"], []])
-def test_commands_of_the_laboratory_have_their_old_names_too(calls, word):
-    calls.give("lab.stress.suite", stress=calls.task("stress", "breaks"))
-    assert main([*word, "stress", "--out", "out"]) == 0
-    here = {"jobs": 1, "scheduler": None}
-    assert calls.noted == [("stress", (Path("out"), (), (), None, False, ()), here)]
 
 
 def said(capsys, calls, *options):
@@ -547,12 +459,9 @@ def said(capsys, calls, *options):
     return [stream.split("\n")[:-1] for stream in capsys.readouterr()]
 
 
-def test_quiet_leaves_results_and_warnings(capsys, calls):
+def test_quiet_leaves_results_and_warnings_and_verbose_says_when(capsys, calls):
     assert said(capsys, calls) == [["info", "warning", "the table"], ["half"]]
     assert said(capsys, calls, "--quiet") == [["warning", "the table"], []]
-
-
-def test_verbose_says_when(capsys, calls):
     out, err = said(capsys, calls, "--verbose")
     assert [line.split("s  ")[-1] for line in out] == ["debug", "info", "warning", "the table"]
     assert all(float(line.split()[0]) >= 0 for line in [*out[:-1], *err])
@@ -564,14 +473,6 @@ def torch_threads():
     before = torch.get_num_threads()
     yield before
     torch.set_num_threads(before)
-
-
-@pytest.mark.usefixtures("torch_threads")
-def test_threads(calls, monkeypatch):
-    monkeypatch.setenv("OMP_NUM_THREADS", "7")
-    assert main(["info", "run", "--threads", "1"]) == 0
-    assert os.environ["OMP_NUM_THREADS"] == "1"
-    assert torch.get_num_threads() == 1
 
 
 @pytest.mark.parametrize(

@@ -17,12 +17,7 @@ ROOT = Path(__file__).parent.parent
 TUTORIALS = ROOT / "docs/tutorials"
 COMMAND = re.compile(r"^ {4,}((?:univoxel|python|cp|rm|mkdir|dask|blender|pip) .*)$", re.MULTILINE)
 PYTHON = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
-OTHERS = (
-    "dask ",
-    "blender ",
-    "pip ",
-    "python examples/slurm_batch.py",
-)  # programs that are not ours
+OTHERS = ("dask ", "blender ", "pip ", "python examples/slurm_batch.py")  # programs not ours
 ELSEWHERE = ("--scheduler", "photos/*")  # of a cluster, and of photographs that the reader has
 
 PHONE = "python examples/phone_photographs.py"

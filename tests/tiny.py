@@ -9,9 +9,10 @@ from analytic import write_scene
 from plain import plain_stage, plain_training
 
 from univoxel.cli import main
+from univoxel.cli.trainer import train
 from univoxel.config import JointConfig, TrainConfig
 from univoxel.lights import SGConfig
-from univoxel.scene import SceneConfig
+from univoxel.scene import SceneConfig, load_scene
 
 CHANGES = (
     *(f"stages.{i}.{name}" for i in (0, 1, 3) for name in ("voxels=0.004", "rays=64")),
@@ -53,6 +54,12 @@ def tiny(tmp_path_factory):
     data = write_scene(folder / "data", views=6, size=16)
     assert main(["train", str(data), "--out", str(folder / "run"), *OPTIONS]) == 0
     return folder
+
+
+@pytest.fixture(scope="session")
+def plain(data, tmp_path_factory):
+    """What `three_stages` make of the sphere where nobody looks on."""
+    return load_scene(train(three_stages(data, tmp_path_factory.mktemp("plain") / "run")))
 
 
 @pytest.fixture

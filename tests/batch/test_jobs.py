@@ -5,7 +5,9 @@ Workers and schedulers of a cluster are processes of their own, as people start 
 
 import contextlib
 import dataclasses
+import io
 import json
+import logging
 import os
 import pickle
 import re
@@ -19,8 +21,20 @@ from pathlib import Path
 import pytest
 from clusters import alive, process, scheduler, wait_for, worker
 from filelock import FileLock
+from rich.console import Console
 
-from univoxel.batch.jobs import Job, Step, connect, last_line, run_job, run_jobs
+from univoxel.batch import jobs
+from univoxel.batch.jobs import (
+    Job,
+    ProgressTable,
+    Result,
+    Step,
+    connect,
+    last_line,
+    run_job,
+    run_jobs,
+)
+from univoxel.core import progress_bar
 from univoxel.errors import DataError, ExistingFile, MissingExtra, ProcessFailed, UserError
 
 # A "training": counts to its end through kills, as it keeps where it is, and tells of it
@@ -84,30 +98,9 @@ def test_nothing_listens_for_others_here(tmp_path):
     assert {address.rpartition(":")[0] for address in ours} == {"127.0.0.1"}
 
 
-def test_a_killed_process_is_gone_on_with(tmp_path):
-    job = counting(tmp_path, "mug", last=30, pause=0.1)
-    at = tmp_path / "mug" / "at"
-
-    def kill() -> None:
-        wait_for(lambda: at.exists() and int(at.read_text()) >= 3)
-        os.kill(begun(tmp_path, "mug")[0], signal.SIGKILL)
-
-    killer = threading.Thread(target=kill)
-    killer.start()
-    with connect(1) as client:
-        [ended] = run_jobs(client, [job], 1)
-    killer.join()
-    assert ended.state == "done"
-    assert len(begun(tmp_path, "mug")) == 2
-    assert len((tmp_path / "mug" / "log").read_text().splitlines()) <= 31  # what was done stays
-
-
 def test_a_process_that_dies_each_time_is_given_up_and_others_go_on(tmp_path):
-    dies = saying(
-        tmp_path,
-        "dies",
-        f"import os; open({str(tmp_path / 'n')!r}, 'a').write('x'); os.kill(os.getpid(), 9)",
-    )
+    program = "import os; open({!r}, 'a').write('x'); os.kill(os.getpid(), 9)"
+    dies = saying(tmp_path, "dies", program.format(str(tmp_path / "n")))
     with connect(1) as client:
         found = {e.name: e for e in run_jobs(client, [dies, counting(tmp_path, "mug")], 2, tries=3)}
     assert found["mug"].state == "done"
@@ -152,14 +145,28 @@ def test_what_is_older_than_what_it_is_made_of_is_made_again(tmp_path):
     os.utime(made, (1, 1))
     assert not step.done()
     assert not Step("a", ()).done()
-
-
-def test_an_argument_is_the_first_that_is_there(tmp_path):
-    paths = tmp_path / "cut", tmp_path / "scene"
+    paths = tmp_path / "cut", tmp_path / "scene"  # an argument is the first that is there
     step = Step("train", ("train", paths))
     assert step.words() == ["train", str(paths[1])]
     paths[0].mkdir()
     assert step.words() == ["train", str(paths[0])]
+
+
+def test_jobs_that_are_not_begun(tmp_path):
+    """One that another is at work on, whose files cannot be written, or of other options."""
+    job = dataclasses.replace(counting(tmp_path, "mug"), identity={"seed": 1, "steps": 2})
+    with FileLock(job.file(".lock")):
+        assert run_job(job).state == "locked"
+    assert not begun(tmp_path, "mug")
+    job.check_same()
+    assert run_job(job).state == "done"
+    job.check_same()
+    other = dataclasses.replace(job, identity={"seed": 2, "steps": 2})
+    with pytest.raises(ExistingFile, match=r"mug\.json has other values of seed than this"):
+        other.check_same()
+    full = counting(tmp_path, "full")
+    full.file(".txt").symlink_to("/dev/full")
+    assert "No space left" in run_job(full).errors["files"]
 
 
 def test_two_at_one_folder_share_the_jobs(tmp_path):
@@ -178,24 +185,6 @@ def test_two_at_one_folder_share_the_jobs(tmp_path):
     second.join()
     assert states == ["done"] * 8
     assert [len(begun(tmp_path, job.name)) for job in jobs] == [1] * 4
-
-
-def test_a_job_that_another_is_at_work_on_is_left_alone(tmp_path):
-    job = counting(tmp_path, "mug")
-    with FileLock(job.file(".lock")):
-        assert run_job(job).state == "locked"
-    assert not begun(tmp_path, "mug")
-    assert run_job(job).state == "done"
-
-
-def test_other_options_are_refused(tmp_path):
-    job = dataclasses.replace(counting(tmp_path, "mug"), identity={"seed": 1, "steps": 2})
-    job.check_same()
-    assert run_job(job).state == "done"
-    job.check_same()
-    other = dataclasses.replace(job, identity={"seed": 2, "steps": 2})
-    with pytest.raises(ExistingFile, match=r"mug\.json has other values of seed than this"):
-        other.check_same()
 
 
 def test_the_child_ends_with_its_worker(tmp_path):
@@ -285,38 +274,30 @@ def test_a_scheduler_that_is_gone_is_said_and_its_work_ends(tmp_path):
     assert len(begun(tmp_path, "mug")) == 2
 
 
-def test_a_worker_without_the_package_is_named(tmp_path):
+def test_a_worker_without_the_package_is_named(tmp_path, monkeypatch):
     def run_on_worker(job, topic):
         raise ModuleNotFoundError("No module named 'univoxel'")
 
-    with connect(1) as client, pytest.MonkeyPatch.context() as patch:
-        patch.setattr("univoxel.batch.jobs.run_on_worker", run_on_worker)
+    with connect(1) as client:
+        monkeypatch.setattr("univoxel.batch.jobs.run_on_worker", run_on_worker)
         with pytest.raises(ProcessFailed, match="a worker has another version of univoxel"):
             list(run_jobs(client, [counting(tmp_path, "mug")], 1))
 
 
-def test_a_client_that_ends_takes_its_work_from_the_workers(tmp_path):
+def test_a_client_that_ends_takes_its_work_from_the_workers(tmp_path, monkeypatch):
     job = counting(tmp_path, "mug", last=1000, pause=0.1)
     with scheduler(tmp_path) as (_, address), worker(address):
         with connect(1, address) as client:
             handed_out = run_jobs(client, [job], 1)
             thread = threading.Thread(target=lambda: [*handed_out], daemon=True)
-            with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(threading, "excepthook", lambda _: None)
-                thread.start()
-                wait_for(lambda: begun(tmp_path, "mug"))
-                client.close()
-                thread.join()
+            monkeypatch.setattr(threading, "excepthook", lambda _: None)
+            thread.start()
+            wait_for(lambda: begun(tmp_path, "mug"))
+            client.close()
+            thread.join()
         wait_for(lambda: not alive(begun(tmp_path, "mug")[0]))
         # The worker lets go of the job a moment after its process is gone
         wait_for(lambda: run_job(counting(tmp_path, "mug", last=3)).state == "done")
-
-
-def test_files_that_cannot_be_written_fail_the_job_alone(tmp_path):
-    job = counting(tmp_path, "mug")
-    job.file(".txt").symlink_to("/dev/full")
-    assert "No space left" in run_job(job).errors["files"]
-    assert run_job(counting(tmp_path, "cup")).state == "done"
 
 
 def test_records_that_are_broken_or_of_a_former_version(tmp_path):
@@ -362,15 +343,61 @@ def test_mistakes_are_named(tmp_path, monkeypatch):
         pass
 
 
-def test_workers_of_another_version_are_refused(tmp_path):
-    with (
-        scheduler(tmp_path) as (_, address),
-        worker(address),
-        connect(1, address) as client,
-        pytest.MonkeyPatch.context() as patch,
-    ):
+def test_workers_of_another_version_are_refused(tmp_path, monkeypatch):
+    with scheduler(tmp_path) as (_, address), worker(address), connect(1, address) as client:
         client.wait_for_workers(1)
-        patch.setattr("univoxel.batch.jobs.__version__", "9.9")
-        with pytest.raises(ProcessFailed, match=r"workers with univoxel 9\.9, got \d"):
-            with connect(1, address):
-                pass
+        monkeypatch.setattr("univoxel.batch.jobs.__version__", "9.9")
+        said = pytest.raises(ProcessFailed, match=r"workers with univoxel 9\.9, got \d")
+        with said, connect(1, address):
+            pass
+
+
+# What is shown of jobs at work: rows on a terminal, lines elsewhere, time that is left
+
+
+TOLD = ("mug", "train", 0.25, 23.1)
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Seconds that have passed."""
+    time = {"now": 0.0}
+    monkeypatch.setattr(jobs.time, "monotonic", lambda: time["now"])
+    return time
+
+
+def test_lines_name_who_is_at_work(clock, monkeypatch, caplog):
+    monkeypatch.setattr(progress_bar, "LINE_SECONDS", 0.0)
+
+    def line(table: ProgressTable) -> str:
+        table.refresh()
+        return caplog.messages[-1]
+
+    with caplog.at_level(logging.INFO, "univoxel"):
+        table = ProgressTable(1, 3)
+        table.tell(*TOLD)
+        assert line(table).startswith("1/3  mug train 25% 23.1 dB")
+        table.tell("cup", "eval", None, None)
+        assert "25% 23.1 dB  cup eval" in line(table)
+        clock["now"] = 60.0
+        table.ended(Result("mug", "failed", {"train": "x"}))
+        assert line(table).startswith("2/3  1 failed  about 0:01:00 left  cup eval")
+        table.ended(Result("cup", "killed"))  # it is tried again
+        assert "cup" not in line(table)
+
+
+def test_rows_on_a_terminal(monkeypatch, caplog):
+    drawn = io.StringIO()
+    console = Console(file=drawn, force_terminal=True, width=120)
+    monkeypatch.setattr(progress_bar, "Console", lambda stderr: console)
+    with caplog.at_level(logging.INFO, "univoxel"):
+        table = ProgressTable(0, 2)
+        with table.progress:
+            table.tell(*TOLD)
+            table.tell("cup", "eval", None, None)
+            table.refresh()
+            table.progress.refresh()
+        (task,) = table.progress.tasks
+        assert (task.description, task.completed) == ("0/2", 0.25)
+        assert task.fields["facts"] == "mug train 25% 23.1 dB\ncup eval"
+        assert "cup eval" in drawn.getvalue()

@@ -1,10 +1,9 @@
-"""Turning, grouping, choosing pairs, judging: the parts of a capture that need no program."""
+"""Grouping, choosing pairs, judging, sizes: the parts of a capture that need no program."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from univoxel.capture.model import (
@@ -20,39 +19,14 @@ from univoxel.capture.model import (
 )
 from univoxel.capture.photographs import Photograph
 from univoxel.capture.pose_validation import still, why_not
-from univoxel.capture.prepare import Capture, group, in_words, to_landscape
-from univoxel.capture.scene import gauge_aligned, own_sizes, points_back, to_camera_back
+from univoxel.capture.prepare import Capture, group, in_words
+from univoxel.capture.scene import own_sizes
 from univoxel.capture.structure import choose, features_each, similarities
 from univoxel.data.lens import Lens
 
 
 def photo(name="a.jpg", width=40, height=30, camera="", focal=(0.0, 0.0)) -> Photograph:
     return Photograph(Path(name), width, height, camera, focal)
-
-
-def test_a_camera_turned_back_sees_points_where_the_picture_shows_them():
-    """A pixel of a portrait picture is followed through the turned picture and back."""
-    portrait = np.zeros((40, 30), np.uint8)
-    portrait[7, 21] = 255  # row, column
-    landscape = np.asarray(to_landscape(Image.fromarray(portrait)))
-    assert landscape.shape == (30, 40)
-    (row,), (column,) = np.nonzero(landscape)
-    found = points_back(np.array([column + 0.5, row + 0.5]), 30)
-    np.testing.assert_allclose(found, [21.5, 7.5])
-
-    # The ray of that pixel, in world axes, is the same from either picture
-    turn = Rotation.random(random_state=0).as_matrix()
-    focal = 50.0
-    in_landscape = np.array([(column + 0.5 - 20) / focal, (row + 0.5 - 15) / focal, 1])
-    in_portrait = np.array([(21.5 - 15) / focal, (7.5 - 20) / focal, 1])
-    back = to_camera_back(turn)
-    np.testing.assert_allclose(turn.T @ in_landscape, back.T @ in_portrait)
-    assert np.linalg.det(back) == pytest.approx(1)
-
-
-def test_landscape_is_left_as_it_is():
-    picture = Image.new("L", (40, 30))
-    assert to_landscape(picture) is picture
 
 
 def test_one_lens_at_one_zoom_is_one_camera_held_either_way():
@@ -112,17 +86,11 @@ def test_pairs_are_the_best_partners_and_the_next_by_name():
     assert {(i, i + 1) for i in range(5)} <= set(pairs)
     assert all(i < j for i, j in pairs)
     assert len(pairs) == len(set(pairs))
-
-
-def test_the_work_of_choosing_pairs_is_bounded():
-    assert features_each(60) == features_each(150) == 512
+    assert features_each(60) == features_each(150) == 512  # the work of choosing is bounded
     work = [n**2 * features_each(n) ** 2 for n in (150, 400, 1000)]
     assert max(work) <= work[0]
-
-
-def test_a_shift_alone_counts_as_still():
-    pairs = [(1, 2, 30, 7), (1, 3, 40, 2), (2, 3, 0, 7), (1, 4, 0, 1), (2, 4, 50, 3)]
-    assert still(pairs) == (1, 3)
+    counted = [(1, 2, 30, 7), (1, 3, 40, 2), (2, 3, 0, 7), (1, 4, 0, 1), (2, 4, 50, 3)]
+    assert still(counted) == (1, 3)  # a shift alone counts
 
 
 def test_reasons_of_photographs_without_a_place():
@@ -130,13 +98,11 @@ def test_reasons_of_photographs_without_a_place():
     pairs = [(2, 3, 12, 2), (3, 4, 80, 2)]
     assert why_not(None, features, pairs, {}) == "no features that can be matched"
     assert why_not(1, features, pairs, {}) == "no features that can be matched"
-    assert why_not(2, features, pairs, {}) == (
-        "at most 12 matches with any other photograph, but 15 are needed"
-    )
+    few = "at most 12 matches with any other photograph, but 15 are needed"
+    assert why_not(2, features, pairs, {}) == few
     assert why_not(3, features, pairs, {3: 4}).startswith("connected to 4 photographs")
-    assert why_not(4, features, pairs, {}) == (
-        "80 matches with another photograph, but these contradict the other matches"
-    )
+    wrong = "80 matches with another photograph, but these contradict the other matches"
+    assert why_not(4, features, pairs, {}) == wrong
 
 
 def model(seed=0, views=6) -> Model:
@@ -193,27 +159,16 @@ def test_a_model_is_read_as_it_was_written(tmp_path):
         np.testing.assert_array_equal(a, b)
     assert two.cameras == one.cameras
     assert two.error == pytest.approx(one.error)
-
-
-def test_the_largest_model_comes_first(tmp_path):
-    write_model(tmp_path / "0", model(views=3))
-    write_model(tmp_path / "1", model(views=6))
-    assert [len(m.images) for m in read_models(tmp_path)] == [6, 3]
-
-
-def test_settling_turns_up_centres_and_scales_without_moving_pictures():
-    one = model(3)
-    two, known = gauge_aligned(one)
-    assert known
-    centres = np.stack([i.centre for i in two.images])
-    assert np.median(np.linalg.norm(centres, axis=1)) == pytest.approx(4)
-    assert centres[0, 0] == pytest.approx(0, abs=1e-9)
-    assert centres[0, 1] < 0
-    expected = np.array([2 + 0.3 * (v % 2) for v in range(6)])
-    scale = 4 / np.median(np.hypot(5, expected))
-    np.testing.assert_allclose(centres[:, 2], scale * expected, atol=1e-2)
-    for a, b in zip(one.images, two.images, strict=True):
-        np.testing.assert_allclose(_projected(one, a), _projected(two, b), atol=1e-9)
+    write_model(tmp_path / "1", model(views=3))
+    assert [len(m.images) for m in read_models(tmp_path)] == [6, 3]  # the largest comes first
+    two = without(one, {1, 2, 3})  # images that are left out leave no trace
+    assert [i.number for i in two.images] == [4, 5, 6]
+    for track in two.points.tracks:
+        assert len(track) >= 2
+        assert set(track["image"]) <= {4, 5, 6}
+    kept = set(two.points.number.tolist())
+    for image in two.images:
+        assert set(image.point.tolist()) <= kept | {NO_POINT}
 
 
 def test_pictures_of_their_own_size_see_the_same_points():
@@ -228,15 +183,3 @@ def test_pictures_of_their_own_size_see_the_same_points():
         assert (lens.height > lens.width) == bool(v % 2)
         np.testing.assert_allclose(_projected(two, image), image.xy, atol=1e-9)
         assert image.name == f"{v}.jpg"
-
-
-def test_left_out_images_leave_no_trace():
-    one = model(2)
-    two = without(one, {1, 2, 3})
-    assert [i.number for i in two.images] == [4, 5, 6]
-    for track in two.points.tracks:
-        assert len(track) >= 2
-        assert set(track["image"]) <= {4, 5, 6}
-    kept = set(two.points.number.tolist())
-    for image in two.images:
-        assert set(image.point.tolist()) <= kept | {NO_POINT}

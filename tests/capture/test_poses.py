@@ -1,7 +1,6 @@
 """From photographs as they come to cameras: runs of structure from motion on a made scene."""
 
 import json
-import logging
 import os
 import shutil
 import sqlite3
@@ -26,7 +25,7 @@ from univoxel.capture.model import NO_POINT, read_model
 from univoxel.capture.photographs import find_photographs
 from univoxel.capture.poses import poses
 from univoxel.capture.prepare import Folders, gather
-from univoxel.core import files
+from univoxel.core import files, log
 from univoxel.data.colmap import read_cameras, read_images
 from univoxel.errors import DataError, ExistingFile, MissingExtra, ProcessFailed
 
@@ -86,19 +85,11 @@ def photographs(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def scene(photographs, tmp_path_factory) -> tuple[Path, list[str]]:
-    said = []
-    handler = logging.Handler()
-    handler.emit = lambda record: said.append(record.getMessage())
-    logger = logging.getLogger("univoxel")
-    level = logger.level
-    logger.addHandler(handler)
-    logger.setLevel(logging.INFO)
-    out = tmp_path_factory.mktemp("out") / "scene"
-    try:
+    said, out = [], tmp_path_factory.mktemp("out") / "scene"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(log, "isEnabledFor", lambda level: True)
+        patch.setattr(log, "handle", lambda record: said.append(record.getMessage()))
         poses(photographs, out, config=SMALL)
-    finally:
-        logger.removeHandler(handler)
-        logger.setLevel(level)
     return out, said
 
 
@@ -126,7 +117,16 @@ def test_photographs_as_they_come_are_placed(scene):
 
 
 def test_pictures_are_upright_and_fit_their_cameras(scene):
+    """And what they see of the points is where the cameras project them."""
     out, _ = scene
+    model = read_model(out / "sparse/0")
+    position = dict(zip(model.points.number.tolist(), model.points.position, strict=True))
+    for image in model.images:
+        lens, seen = model.cameras[image.camera], image.point != NO_POINT
+        points = np.stack([position[p] for p in image.point[seen].tolist()])
+        x, y, z = image.to_camera[:, :3] @ points.T + image.to_camera[:, 3:]
+        found = np.stack(lens.seen(x / z, y / z), -1)
+        assert np.median(np.linalg.norm(found - image.xy[seen], axis=1)) < 1  # pixel
     lenses = read_cameras(out / "sparse/0/cameras.bin")
     assert len(lenses) == 4  # two zooms, held both ways
     for image in read_images(out / "sparse/0/images.bin"):
@@ -163,19 +163,6 @@ def test_what_is_left_out_is_named(scene):
     assert rows["IMG 02.heic"]["written"] == "IMG 02.jpg"
     assert all(row["points"] > 100 for name, row in rows.items() if name != "white.jpg")
     assert report["error"] < 1
-
-
-def test_the_model_holds_together(scene):
-    """What the pictures see of the points is where the cameras project them."""
-    out, _ = scene
-    model = read_model(out / "sparse/0")
-    position = dict(zip(model.points.number.tolist(), model.points.position, strict=True))
-    for image in model.images:
-        lens, seen = model.cameras[image.camera], image.point != NO_POINT
-        points = np.stack([position[p] for p in image.point[seen].tolist()])
-        x, y, z = image.to_camera[:, :3] @ points.T + image.to_camera[:, 3:]
-        found = np.stack(lens.seen(x / z, y / z), -1)
-        assert np.median(np.linalg.norm(found - image.xy[seen], axis=1)) < 1  # pixel
 
 
 def test_the_same_again_is_done_and_other_settings_are_refused(scene, photographs, monkeypatch):
@@ -333,7 +320,7 @@ def test_too_few_placed_is_one_line(photographs, tmp_path):
     assert not (tmp_path / "out/images").exists()
 
 
-def test_what_is_no_folder_of_photographs_is_one_line(tmp_path):
+def test_what_cannot_be_begun_is_one_line(tmp_path, monkeypatch):
     with pytest.raises(DataError, match="expected a folder of photographs or a video"):
         poses(tmp_path / "none", tmp_path / "out")
     with pytest.raises(DataError, match="every applies only to videos"):
@@ -344,13 +331,10 @@ def test_what_is_no_folder_of_photographs_is_one_line(tmp_path):
     (tmp_path / "out" / "mine.txt").touch()
     with pytest.raises(ExistingFile, match=r"contains other files \(mine.txt\)"):
         poses(tmp_path, tmp_path / "out")
-
-
-def test_without_pycolmap_nothing_is_read(tmp_path, monkeypatch):
     monkeypatch.setattr(sfm.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MissingExtra, match=r"pip install 'univoxel\[capture\]'"):
-        poses(tmp_path / "not there", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
+        poses(tmp_path / "not there", tmp_path / "other")
+    assert not (tmp_path / "other").exists()
 
 
 def pycolmap_that(does: str, folder: Path) -> str:

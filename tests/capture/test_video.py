@@ -15,12 +15,9 @@ from univoxel.capture.prepare import Folders
 from univoxel.errors import DataError, MissingExtra
 
 
-def test_the_sharpest_of_each_group():
+def test_blur_is_less_sharp_and_the_sharpest_of_each_group_is_taken():
     assert sharpest([1, 3, 2, 9, 8, 7, 4], 3) == [1, 3, 6]
     assert sharpest([], 3) == []
-
-
-def test_blur_is_less_sharp():
     noise = np.random.default_rng(0).integers(0, 256, (60, 80)).astype(np.uint8)
     assert sharpness(noise) > 2 * sharpness(gaussian_filter(noise, 1.0))
 
@@ -46,25 +43,29 @@ def film(tmp_path_factory):
     return path
 
 
-def test_sharp_frames_are_kept_all_along(film, tmp_path):
+def test_sharp_frames_are_kept_all_along(film, tmp_path, monkeypatch):
     assert seconds(film) == pytest.approx(4, abs=0.2)
     count = write_frames(film, tmp_path, every=0.5)
     files = sorted(tmp_path.glob("frame_*.jpg"))
     assert len(files) == count == 8
     corners = [np.asarray(Image.open(path))[4:20, 4:20].mean() for path in files]
     assert min(corners) > 200  # all sharp, though two of three are not
-
-
-def test_the_number_of_frames_is_limited(film, tmp_path, monkeypatch):
     monkeypatch.setattr(photographs, "KEPT", 5)
-    assert write_frames(film, tmp_path) == 5
+    assert write_frames(film, tmp_path / "few") == 5
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "concat:film.mp4"  # a name is no protocol
+    path.write_bytes(film.read_bytes())
+    assert seconds(path.relative_to(tmp_path)) == pytest.approx(4, abs=0.2)
+
+
+def ffmpeg(*arguments, **options):
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *map(str, arguments)]
+    return subprocess.run(command, check=True, **options)
 
 
 def test_a_turned_video_comes_upright(film, tmp_path):
     turned = tmp_path / "turned.mp4"
-    program = imageio_ffmpeg.get_ffmpeg_exe()
-    command = [program, "-v", "error", "-display_rotation:v:0", "90", "-i", str(film), "-c", "copy"]
-    subprocess.run([*command, str(turned)], check=True)
+    ffmpeg("-display_rotation:v:0", 90, "-i", film, "-c", "copy", turned)
     write_frames(turned, tmp_path / "frames", every=1.0)
     with Image.open(tmp_path / "frames/frame_00000.jpg") as picture:
         assert picture.size == (120, 160)
@@ -89,11 +90,10 @@ def test_colours_are_those_of_the_video(tmp_path, matrix, full, tagged, height):
     scale = f"scale=out_color_matrix={matrix}:out_range={'pc' if full else 'tv'}"
     tag = ["-colorspace", "smpte170m" if matrix == "bt601" else matrix] if tagged else []
     drop = [] if tagged else ["-bsf:v", "h264_metadata=matrix_coefficients=2"]
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-loop", "1", "-framerate", "5"]
-    command += ["-i", str(tmp_path / "a.png"), "-t", "1", "-vf", scale, *tag, *drop]
-    command += ["-color_range", "pc" if full else "tv", "-crf", "4"]
-    command += ["-pix_fmt", "yuvj420p" if full else "yuv420p", str(tmp_path / "a.mp4")]
-    subprocess.run(command, check=True)
+    given = ["-loop", "1", "-framerate", "5", "-i", tmp_path / "a.png", "-t", "1", "-vf", scale]
+    made = ["-color_range", "pc" if full else "tv", "-crf", "4"]
+    made += ["-pix_fmt", "yuvj420p" if full else "yuv420p", tmp_path / "a.mp4"]
+    ffmpeg(*given, *tag, *drop, *made)
     assert write_frames(tmp_path / "a.mp4", tmp_path / "100% wool") == 1  # it stands still
     found = np.asarray(Image.open(tmp_path / "100% wool/frame_00000.jpg"))
     middles = found[height // 2, height // 8 :: height // 4].tolist()
@@ -152,11 +152,10 @@ def test_wide_colours_and_hdr_become_those_of_709(
     row = codes(np.repeat(np.array(COLORS) / 255, 20, 0))
     frame = np.round(65535 * row).astype("<u2")[None].repeat(64, 0)
     tags = f"setsar=2,setparams=color_primaries={primaries}:color_trc={curve}"
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-f", "rawvideo", "-r", "5"]
-    command += ["-pix_fmt", "rgb48le", "-s", "80x64", "-i", "-", "-vf"]
-    command += [f"scale=out_color_matrix={matrix}:out_range=tv,{tags}", "-c:v", "libx264"]
-    command += ["-pix_fmt", "yuv420p10le", "-crf", "2", str(tmp_path / "a.mp4")]
-    subprocess.run(command, check=True, input=5 * frame.tobytes())
+    given = ["-f", "rawvideo", "-r", "5", "-pix_fmt", "rgb48le", "-s", "80x64", "-i", "-", "-vf"]
+    given += [f"scale=out_color_matrix={matrix}:out_range=tv,{tags}", "-c:v", "libx264"]
+    made = ["-pix_fmt", "yuv420p10le", "-crf", "2", tmp_path / "a.mp4"]
+    ffmpeg(*given, *made, input=5 * frame.tobytes())
     assert write_frames(tmp_path / "a.mp4", tmp_path / "frames") == 1
     found = np.asarray(Image.open(tmp_path / "frames/frame_00000.jpg"))
     assert found.shape == (64, 160, 3)
@@ -166,17 +165,15 @@ def test_wide_colours_and_hdr_become_those_of_709(
 
 def test_frames_that_are_doubled_are_taken_once(film, tmp_path):
     """As recorders of screens write them; noise of the encoder makes no picture of its own."""
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(film), "-vf"]
     slow = "select='not(mod(n,10))',setpts=N/TB,fps=20,noise=alls=1:allf=t"
-    subprocess.run([*command, slow, "-crf", "30", str(tmp_path / "a.mp4")], check=True)
+    ffmpeg("-i", film, "-vf", slow, "-crf", "30", tmp_path / "a.mp4")
     assert write_frames(tmp_path / "a.mp4", tmp_path / "frames", every=0.25) <= 4
 
 
 def test_a_recording_that_does_not_know_its_length(film, tmp_path):
     """As browsers write them, while they come."""
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(film), "-c", "copy"]
-    piped = [*command, "-f", "matroska", "-live", "1", "-"]
-    done = subprocess.run(piped, check=True, capture_output=True)
+    options = ["-c", "copy", "-f", "matroska", "-live", "1", "-"]
+    done = ffmpeg("-i", film, *options, capture_output=True)
     (tmp_path / "a.mkv").write_bytes(done.stdout)
     assert seconds(tmp_path / "a.mkv") == pytest.approx(3.9, abs=0.15)  # begin of the last
 
@@ -186,10 +183,9 @@ def test_what_is_no_video_is_one_line(tmp_path):
     path.write_bytes(b"no video" * 50)
     assert is_video(path)
     assert not is_video(tmp_path)
-    with pytest.raises(DataError, match=r"a.mp4: .*this video"):
-        write_frames(path, tmp_path / "frames")
-    with pytest.raises(DataError, match=r"a.mp4: .*this video"):
-        write_frames(path, tmp_path / "frames", every=1.0)
+    for every in (None, 1.0):
+        with pytest.raises(DataError, match=r"a.mp4: .*this video"):
+            write_frames(path, tmp_path / "frames", every)
 
 
 def test_frames_are_chosen_once_and_anew_for_other_wishes(film, tmp_path, monkeypatch):
@@ -203,12 +199,9 @@ def test_frames_are_chosen_once_and_anew_for_other_wishes(film, tmp_path, monkey
         files, others, doubles = tasks_poses.photographs_of(film, folders, every)
         assert (len(files), others, doubles) == (frames, [], 0)
     assert calls == [0.5, 2.0]
-
-
-def test_without_ffmpeg_nothing_is_read(film, tmp_path, monkeypatch):
     monkeypatch.setattr(photographs.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MissingExtra, match="a video needs imageio-ffmpeg"):
-        tasks_poses.photographs_of(film, Folders(tmp_path), None)
+        tasks_poses.photographs_of(film, folders, None)
 
 
 @pytest.mark.parametrize(
@@ -219,14 +212,6 @@ def test_lists_of_other_files_are_no_videos(film, tmp_path, text):
     (tmp_path / "secret.mp4").write_bytes(film.read_bytes())
     path = tmp_path / "list.mp4"
     path.write_text(text.format("secret.mp4"))
-    with pytest.raises(DataError, match=r"list\.mp4: this video could not be read"):
-        write_frames(path, tmp_path / "frames")
-    with pytest.raises(DataError, match=r"list\.mp4: this video could not be read"):
-        write_frames(path, tmp_path / "frames", every=0.5)
-
-
-def test_a_name_is_no_protocol(film, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    path = tmp_path / "concat:film.mp4"
-    path.write_bytes(film.read_bytes())
-    assert seconds(path.relative_to(tmp_path)) == pytest.approx(4, abs=0.2)
+    for every in (None, 0.5):
+        with pytest.raises(DataError, match=r"list\.mp4: this video could not be read"):
+            write_frames(path, tmp_path / "frames", every)

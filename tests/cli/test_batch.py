@@ -125,10 +125,6 @@ def test_each_scene_has_all_of_its_results(night):
     assert [row["name"] for row in rows] == ["ball", "cup"]
     assert [row["verdict"] for row in rows] == [ball["verdict"], cup["verdict"]]
     assert float(rows[1]["nvs_psnr"]) == pytest.approx(cup["measures"]["nvs_psnr"], rel=1e-5)
-
-
-def test_the_page_shows_them_and_needs_no_other_file(night):
-    out, _ = night
     page = (out / "index.html").read_text()
     assert page.count('<img alt="" src="data:image/jpeg;base64,') == 2
     assert page.rstrip().endswith("</html>")
@@ -139,7 +135,7 @@ def test_the_page_shows_them_and_needs_no_other_file(night):
     assert not re.search(r'(src|href)="https?:', page)
 
 
-def test_what_is_done_is_not_done_again(night, scenes, monkeypatch, capsys):
+def test_what_is_done_is_not_done_again(night, scenes, capsys):
     out, options = night
     before = {path: path.stat().st_mtime_ns for path in (out / "ball").rglob("*")}
     arguments = ["batch", *map(str, scenes), "--out", str(out), *options]
@@ -148,10 +144,6 @@ def test_what_is_done_is_not_done_again(night, scenes, monkeypatch, capsys):
     assert json.loads(captured.out) == json.loads((out / "batch.json").read_text())
     assert {path: path.stat().st_mtime_ns for path in (out / "ball").rglob("*")} == before
     assert trainings(out, "ball") == 1
-
-
-def test_another_training_is_refused(night, scenes, capsys):
-    out, options = night
     assert main(["batch", str(scenes[0]), "--out", str(out), *options, "--set=seed=4"]) == 2
     assert re.search(r"ball\.json has other values of changes .*--out", capsys.readouterr().err)
 
@@ -279,15 +271,11 @@ def test_a_machine_is_shared(scenes, tmp_path):
     most = bytes_of(scenes[0], config)
     assert share(known, config, 16.0, Memory(10**13, int(3.5 * most))) == (3, 5)
     assert share(known, config, 16.0, Memory(most // 2, None)) == (1, 16)
-
-
-def test_more_pictures_need_more_memory(scenes, tmp_path):
-    config = USUAL.training()
-    many = write_scene(tmp_path / "many", views=12, size=64)
-    each = PER_PIXEL + FURTHER  # the photograph, and what training makes of it
-    assert bytes_of(many, config) - bytes_of(scenes[0], config) == each * (14 * 64**2 - 8 * 16**2)
+    # More pictures need more memory: the photograph, and what training makes of it
+    many, each = write_scene(tmp_path / "many", views=12, size=64), PER_PIXEL + FURTHER
+    assert bytes_of(many, config) - most == each * (14 * 64**2 - 8 * 16**2)
     (many / "train" / "r_0.png").write_bytes(b"")
-    assert bytes_of(many, config) - bytes_of(scenes[0], config) == each * (13 * 64**2 - 8 * 16**2)
+    assert bytes_of(many, config) - most == each * (13 * 64**2 - 8 * 16**2)
 
 
 def test_mistakes_are_found_before_anything_is_begun(scenes, tmp_path, monkeypatch):
@@ -296,12 +284,11 @@ def test_mistakes_are_found_before_anything_is_begun(scenes, tmp_path, monkeypat
             run_batch(given, tmp_path / "out", **options)
         assert not (tmp_path / "out").exists()
 
+    (tmp_path / "mug.mp4").touch()
+    assert named([tmp_path / "mug.mp4"]) == {"mug": tmp_path / "mug.mp4"}  # a video is a scene
     refused(UserError, "expected at least one scene", [])
-    refused(
-        UserError,
-        "nothing: expected a scene, but the folder does not exist",
-        [tmp_path / "nothing"],
-    )
+    none = "nothing: expected a scene, but the folder does not exist"
+    refused(UserError, none, [tmp_path / "nothing"])
     other = tmp_path / "b" / "ball"
     other.mkdir(parents=True)
     refused(UserError, "folders with different names, got .*ball and .*ball", [scenes[0], other])
@@ -324,11 +311,6 @@ def test_mistakes_are_found_before_anything_is_begun(scenes, tmp_path, monkeypat
     refused(UserError, "expected jobs or scheduler, but not both", scheduler="tcp://x:1")
     monkeypatch.setitem(sys.modules, "distributed", None)
     refused(MissingExtra, r"univoxel\[cluster\]")
-
-
-def test_a_video_is_a_scene(tmp_path):
-    (tmp_path / "mug.mp4").touch()
-    assert named([tmp_path / "mug.mp4"]) == {"mug": tmp_path / "mug.mp4"}
 
 
 def test_what_is_not_known_is_a_dash_or_empty(tmp_path):

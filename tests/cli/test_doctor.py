@@ -42,12 +42,6 @@ def test_everything_is_there(tmp_path):
     assert found["OpenMP"]["found"].count(".so") == 1 or "darwin" in found["Python"]["found"]
 
 
-@pytest.mark.parametrize("arguments", [["--version", "--verbose"], ["--verbose", "--version"]])
-def test_the_long_version(arguments, capsys):
-    assert main(arguments) == 0
-    assert "Embree" in capsys.readouterr().out
-
-
 def test_a_build_without_embree(without_embree, capsys):
     assert native_status().embree is None
     found = by_name(doctor.look())
@@ -71,7 +65,33 @@ def test_no_build_at_all(monkeypatch):
         doctor.check([finding, doctor.embree(status)])
 
 
-def test_findings_that_ask_for_a_look():
+def test_extras_and_what_is_missing_of_them(monkeypatch):
+    requirements = [
+        "torch>=2.4",
+        'pytest>=8; extra == "dev"',
+        'numpy>=1; extra == "sums"',
+        "no-such-package[all]>=3 ; python_version > '3' and extra == 'many'",
+        "neither_this (>=1) ; extra == 'many'",
+    ]
+    assert doctor.extras("no-such-distribution") is None
+    monkeypatch.setattr(doctor.metadata, "requires", lambda name: requirements)
+    assert doctor.extras() == {"many": ["no-such-package", "neither_this"], "sums": []}
+
+
+@pytest.mark.parametrize(
+    ("cuda", "hip", "said"),
+    [(None, None, "CPUs"), ("12.1", None, "CUDA 12.1"), (None, "6.0", "ROCm 6.0")],
+)
+def test_what_torch_was_built_for(monkeypatch, cuda, hip, said):
+    monkeypatch.setattr(torch.version, "cuda", cuda)
+    monkeypatch.setattr(torch.version, "hip", hip)
+    assert doctor.torch_build() == f"{torch.__version__}, built for {said}"
+
+
+def test_findings_that_ask_for_a_look(capsys):
+    for arguments in (["--version", "--verbose"], ["--verbose", "--version"]):
+        assert main(arguments) == 0
+        assert "Embree" in capsys.readouterr().out
     assert doctor.kernels(GOOD).state == doctor.embree(GOOD).state == "good"
     slow = dataclasses.replace(GOOD, usable=("default", "avx2", "avx512"))
     assert doctor.kernels(slow).state == "look"

@@ -43,14 +43,9 @@ def test_the_map_is_written_as_it_is(run):
     assert envmap(folder, out, height=32) is None
     assert torch.equal(read_image(out), map)
     assert read_image(out.with_suffix(".png")).shape == (32, 4 * 32, 3)
-
-
-def test_the_map_as_hdr(run):
-    """Pixels of a common exponent: off by half of 1/128 of the largest channel at most."""
-    folder, map = run
-    out = folder / "map.hdr"
-    assert envmap(folder, out, height=32) is None
-    error = (read_image(out) - map).abs()
+    # Pixels of a common exponent: off by half of 1/128 of the largest channel at most
+    assert envmap(folder, folder / "map.hdr", height=32) is None
+    error = (read_image(folder / "map.hdr") - map).abs()
     assert (error <= map.amax(2, keepdim=True) / 256).all()
     assert error.max() > 0
 
@@ -88,6 +83,10 @@ def test_a_turned_light_is_noticed(run):
     assert abs(found.brightest_degrees - math.degrees(angle)) < 5  # places lie 3 degrees apart
     assert found.ball_psnr < 30
     assert found.mirror_psnr < 30
+    fine = map.repeat_interleave(4, 0).repeat_interleave(4, 1)  # of another size
+    found = compare(map, fine)
+    assert found.ball_psnr > 45
+    assert found.brightest_degrees < 4
 
 
 def test_a_mirror_ball_tells_what_a_grey_one_does_not():
@@ -129,41 +128,23 @@ def test_the_picture_shows_the_light_where_it_is(run):
     assert picture[:16, 32:64].mean() > picture[:16, :32].mean()  # right of the centre: -Y
 
 
-def test_compare_takes_maps_of_two_sizes(run):
-    _, map = run
-    fine = map.repeat_interleave(4, 0).repeat_interleave(4, 1)
-    found = compare(map, fine)
-    assert found.ball_psnr > 45
-    assert found.brightest_degrees < 4
-
-
-def test_a_run_without_a_map(tmp_path):
-    save_scene(sphere_scene(0), tmp_path, {})
-    with pytest.raises(
-        ValueError, match=r"has no environment map, because it was trained with local light \(sg\)"
-    ):
-        envmap(tmp_path, tmp_path / "map.exr")
-    assert not (tmp_path / "map.exr").exists()
-
-
-def test_bad_arguments(run):
-    folder, _ = run
-    with pytest.raises(
-        ValueError, match=r"out: expected a name that ends in \.exr or \.hdr, got .*map\.png"
-    ):
+def test_what_has_no_map_or_none_to_compare(run):
+    folder, map = run
+    out, path = folder / "map.exr", folder / "data" / "envmaps" / "train.exr"
+    with pytest.raises(ValueError, match=r"a name that ends in \.exr or \.hdr, got .*map\.png"):
         envmap(folder, folder / "map.png")
     with pytest.raises(ValueError, match="height must be at least 1, got 0"):
-        envmap(folder, folder / "map.exr", height=0)
-
-
-def test_a_true_map_that_is_none(run):
-    folder, map = run
-    path = folder / "data" / "envmaps" / "train.exr"
+        envmap(folder, out, height=0)
     write_map(path, map[:, :40])
-    with pytest.raises(
-        DataError, match=r"train\.exr: environment map: expected an array .H, W, 3. with W = 2 H"
-    ):
-        envmap(folder, folder / "map.exr")
+    said = r"train\.exr: environment map: expected an array .H, W, 3. with W = 2 H"
+    with pytest.raises(DataError, match=said):
+        envmap(folder, out)
     path.write_bytes(b"nothing")
     with pytest.raises(DataError, match=r"train\.exr: this OpenEXR file could not be read"):
-        envmap(folder, folder / "map.exr")
+        envmap(folder, out)
+    out.unlink(missing_ok=True)
+    save_scene(sphere_scene(0), folder, {})
+    said = r"has no environment map, because it was trained with local light \(sg\)"
+    with pytest.raises(ValueError, match=said):
+        envmap(folder, out)
+    assert not out.exists()

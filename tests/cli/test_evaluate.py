@@ -10,6 +10,7 @@ import pytest
 import rich
 import torch
 from balls import surface_at
+from layouts import repainted, rewritten, without
 from torch import nn
 
 from univoxel.cli import evaluate as task
@@ -19,7 +20,6 @@ from univoxel.data import load_photos
 from univoxel.data.images import read_exr, read_image, write_png
 from univoxel.errors import DataError
 from univoxel.evaluation import measures
-from univoxel.evaluation import measures as layers_module
 from univoxel.evaluation.measures import expected_view
 from univoxel.render.pictures import TILE, Panel, contact_sheet, heat, shrink
 
@@ -100,11 +100,8 @@ def relit_calls(monkeypatch):
         return surface, wo
 
     def relight_surface(surface, wo, traced, lighting, *, samples, bounces):
-        calls.append(
-            SimpleNamespace(
-                mesh=traced.mesh, samples=samples, bounces=bounces, offset=traced.offset
-            )
-        )
+        told = {"samples": samples, "bounces": bounces, "offset": traced.offset}
+        calls.append(SimpleNamespace(mesh=traced.mesh, **told))
         assert len(surface.opacity) == int(inside().sum())  # nothing outside is shaded
         return surface.albedo * lighting.tables.radiance.mean()
 
@@ -113,10 +110,9 @@ def relit_calls(monkeypatch):
         albedo = torch.tensor([[0.25, 0.5, 0.5], [0.75, 0.5, 0.5], [0.25, 0.5, 0.5]])
         return Mesh(corner, torch.tensor([[0, 1, 2]], dtype=torch.int32), albedo=albedo)
 
-    for module in (measures, layers_module):
-        monkeypatch.setattr(module, "surface_of_view", surface_of_view)
-    monkeypatch.setattr(layers_module, "shade", lambda scene, surface, wo: surface.albedo * SCALE)
-    monkeypatch.setattr(layers_module, "relight_surface", relight_surface)
+    monkeypatch.setattr(measures, "surface_of_view", surface_of_view)
+    monkeypatch.setattr(measures, "shade", lambda scene, surface, wo: surface.albedo * SCALE)
+    monkeypatch.setattr(measures, "relight_surface", relight_surface)
     monkeypatch.setattr("univoxel.render.pipeline.extract_mesh", extract_mesh)
     state = {"seconds": 8.5, "threads": 2, "peak_rss_mb": 700.0}
     monkeypatch.setattr("univoxel.scene.load_checkpoint", lambda run: (scene, state))
@@ -148,15 +144,19 @@ def test_measures_of_a_known_scene(folders, relit_calls, capsys):
     assert "normal_mae_deg" in capsys.readouterr().out
 
 
-def test_novel_views_on_white(folders, relit_calls):
+def test_on_white_in_json_and_of_other_data(folders, relit_calls, tmp_path, monkeypatch):
     """Photograph and render alike: where nothing is, both are white."""
-    assert task.evaluate(folders.run, background="white")["nvs_psnr"] == pytest.approx(100)
-
-
-def test_photographs_and_renders_stand_on_the_same_grey(folders):
-    truth = load_photos(folders.data, "test")
+    empty = Mesh(torch.empty(0, 3), torch.empty(0, 3, dtype=torch.int32))
+    monkeypatch.setattr("univoxel.render.pipeline.extract_mesh", lambda scene: empty)
+    (folders.run / "config.json").unlink()
+    options = {"background": "white", "data": folders.data, "json": tmp_path / "measures.json"}
+    result = task.evaluate(folders.run, **options)
+    assert result["nvs_psnr"] == pytest.approx(100)
+    assert result["chamfer"] is None
+    unknown = {"complete": None, "verdict": None}  # it was not trained
+    assert json.loads((tmp_path / "measures.json").read_text()) == result | unknown
+    truth, outside = load_photos(folders.data, "test"), ~inside()
     black, white = (expected_view(truth, {}, 0, behind) for behind in ("black", "white"))
-    outside = ~inside()
     assert not black.photo[outside].any()
     torch.testing.assert_close(white.photo[outside], torch.ones_like(white.photo[outside]))
     assert torch.equal(black.photo[inside()], white.photo[inside()])
@@ -179,7 +179,7 @@ def test_raw_albedo_against_a_formula(folders, relit_calls):
 def test_foreground_psnr_leaves_the_background_out(folders, relit_calls):
     """A quarter of the picture is inside: the same error there weighs four times as much."""
     truth = load_photos(folders.data, "test")
-    layers = layers_module.render_layers(nn.Identity(), truth.cameras, 0)
+    layers = measures.render_layers(nn.Identity(), truth.cameras, 0)
     expected = expected_view(truth, {}, 0)
     numbers = dict(measures.score(layers, expected, measures.Scales(torch.ones(3), torch.ones(3))))
     difference = numbers["albedo_psnr_3ch"] - numbers["albedo_psnr_fg"]
@@ -220,12 +220,6 @@ def test_saved_layers(folders, relit_calls, tmp_path):
     assert sheet.shape[1] > 15 * TILE  # five quantities of three columns
 
 
-def test_json_holds_the_result(folders, relit_calls, tmp_path):
-    result = task.evaluate(folders.run, json=tmp_path / "measures.json")
-    unknown = {"complete": None, "verdict": None}  # it was not trained
-    assert json.loads((tmp_path / "measures.json").read_text()) == result | unknown
-
-
 def test_without_truth_measures_are_null(folders, relit_calls, tmp_path):
     for path in (folders.data / "test" / "gt").iterdir():
         path.unlink()
@@ -241,19 +235,13 @@ def test_without_truth_measures_are_null(folders, relit_calls, tmp_path):
     assert (tmp_path / "out" / "contact_sheet.png").is_file()
 
 
-def test_an_empty_mesh_has_no_chamfer_distance(folders, relit_calls, monkeypatch):
-    empty = Mesh(torch.empty(0, 3), torch.empty(0, 3, dtype=torch.int32))
-    monkeypatch.setattr("univoxel.render.pipeline.extract_mesh", lambda scene: empty)
-    assert task.evaluate(folders.run)["chamfer"] is None
-
-
 def test_expected_errors_are_compared_with_true_ones(folders, relit_calls):
     """Expected errors that grow with the true ones foretell them; others say the opposite."""
     photos = load_photos(folders.data, "test")
     ones = measures.Scales(torch.ones(3), torch.ones(3))
     pairs = []
     for view in range(2):
-        layers = layers_module.render_layers(nn.Identity(), photos.cameras, view)
+        layers = measures.render_layers(nn.Identity(), photos.cameras, view)
         expected = expected_view(photos, {}, view)
         error = (linear_to_srgb(layers.albedo) - expected.albedo).abs().mean(-1)
         told = torch.stack([error.sqrt(), 0 * error, 0 * error], -1)
@@ -266,39 +254,28 @@ def test_expected_errors_are_compared_with_true_ones(folders, relit_calls):
     assert measures.rank_correlation([None]) is None
 
 
-def test_other_data_can_be_named(folders, relit_calls):
-    (folders.run / "config.json").unlink()
-    assert task.evaluate(folders.run, data=folders.data)["nvs_psnr"] == pytest.approx(100)
-
-
-def broken_truth(folders):
-    np.savez(folders.data / "test" / "gt" / "r_1.npz", alpha=np.zeros((4, 5), np.uint8))
-
-
-def broken_relit(folders):
-    for view in range(2):
-        write_png(folders.data / "relight" / "dim" / f"r_{view}.png", np.zeros((4, 5, 4), np.uint8))
+CONFIG = "run/config.json"
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("damage", "message"),
     [
-        (lambda f: (f.run / "config.json").unlink(), r"folder of a run, but config"),
+        (without(CONFIG), r"folder of a run, but config"),
+        (rewritten(CONFIG, b"{}"), "config.json: expected data to be a folder"),
+        (rewritten(CONFIG, b"{"), "config.json: .* JSON"),
+        (rewritten("data/envmaps/dim.hdr", b"#?"), r"dim\.hdr: expected a header"),
         (
-            lambda f: (f.run / "config.json").write_text("{}"),
-            "config.json: expected data to be a folder",
+            lambda f: np.savez(f / "data/test/gt/r_1.npz", alpha=np.zeros((4, 5), np.uint8)),
+            "truth of r_1 with 16x16 pixels as in the test view, got 5x4",
         ),
-        (lambda f: (f.run / "config.json").write_text("{"), "config.json: .* JSON"),
         (
-            lambda f: (f.data / "envmaps" / "dim.hdr").write_bytes(b"#?"),
-            r"dim\.hdr: expected a header",
+            repainted("data/relight/dim/r_0.png", np.zeros((4, 5, 4), np.uint8)),
+            r"dim/r_0\.png: expected 16x16 pixels as in the test view, got 5x4",
         ),
-        (broken_truth, "truth of r_1 with 16x16 pixels as in the test view, got 5x4"),
-        (broken_relit, r"dim/r_0\.png: expected 16x16 pixels as in the test view, got 5x4"),
     ],
 )
-def test_bad_folders(folders, relit_calls, change, message):
-    change(folders)
+def test_bad_folders(folders, relit_calls, damage, message):
+    damage(folders.run.parent)
     with pytest.raises(DataError, match=message):
         task.evaluate(folders.run)
 
@@ -316,13 +293,6 @@ def test_bad_settings(folders, change, message):
         task.evaluate(folders.run, **change)
 
 
-def test_heat_rises_from_black_and_ends_at_the_limit():
-    colors = heat(torch.tensor([[0.0, 0.1, 0.2, 0.3]]), 0.2)
-    assert colors[0, 0].tolist() == [0, 0, 0]
-    assert np.array_equal(colors[0, 2], colors[0, 3])
-    assert 0 < colors[0, 1].sum() < colors[0, 2].sum()
-
-
 def test_sheet_shows_the_panels_where_it_says():
     red = torch.tensor([1.0, 0.0, 0.0]).expand(TILE, TILE, 3)
     panel = Panel("albedo", red, 0.5 * red, torch.zeros(TILE, TILE), 0.2)
@@ -334,13 +304,14 @@ def test_sheet_shows_the_panels_where_it_says():
         assert sheet[y, margin + 2 * cell + 80].tolist() == [0, 0, 0]
 
 
-def test_large_panels_shrink():
+def test_parts_of_a_sheet():
+    """Heat rises from black and ends at the limit; large panels shrink; rows are of one kind."""
+    colors = heat(torch.tensor([[0.0, 0.1, 0.2, 0.3]]), 0.2)
+    assert colors[0, 0].tolist() == [0, 0, 0]
+    assert np.array_equal(colors[0, 2], colors[0, 3])
+    assert 0 < colors[0, 1].sum() < colors[0, 2].sum()
     panel = Panel("albedo", torch.rand(8 * TILE, 4 * TILE, 3), None, None, 0.2)
     assert shrink(panel).estimate.shape == (4 * TILE, 2 * TILE, 3)
-
-
-def test_sheet_needs_rows_of_one_kind():
-    panel = Panel("albedo", torch.zeros(4, 4, 3), None, None, 0.2)
     for rows in ([], [("a", [])], [("a", [panel]), ("b", [panel, panel])]):
         with pytest.raises(ValueError, match="rows with the same panels"):
             contact_sheet(rows)

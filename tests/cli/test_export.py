@@ -1,19 +1,25 @@
 """A scene as files that other programs read: same shape, same place, same look."""
 
-import io
 import json
 import shutil
 import subprocess
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from asymmetric_scene import BALLS, albedo, lopsided, roughness, sdf
+from glb import Glb
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from univoxel.cli import export as task
+from univoxel.errors import UserError
+from univoxel.ops import VisibilityScene
+from univoxel.run import save_world
 
 trimesh = pytest.importorskip("trimesh")
+pytest.importorskip("pygltflib")
 
 SIZE = 256
 FACES = 2000
@@ -52,16 +58,11 @@ def surface_of_balls(points):
 
 
 @pytest.fixture(scope="module")
-def scene():
-    return lopsided()
-
-
-@pytest.fixture(scope="module")
-def written(scene, tmp_path_factory):
-    """The scene in each format: name -> path."""
+def written(balls, tmp_path_factory):
+    """The scene in each format."""
     folder = tmp_path_factory.mktemp("out")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("univoxel.scene.load_scene", lambda run: {"run": scene}[str(run)])
+        patch.setattr("univoxel.scene.load_scene", lambda run: {"run": balls}[str(run)])
         for name in ("a.glb", "a.obj", "a.ply"):
             task.export("run", folder / "deep" / name, faces=FACES, texture_size=SIZE)
     return folder / "deep"
@@ -83,35 +84,17 @@ def test_only_the_files_that_are_asked_for(written):
 
 
 def test_glb(written):
-    pygltflib = pytest.importorskip("pygltflib")
-    file = pygltflib.GLTF2().load(str(written / "a.glb"))
-    blob = file.binary_blob()
-
-    def view(index):
-        part = file.bufferViews[index]
-        assert part.byteOffset % 4 == 0
-        return blob[part.byteOffset :][: part.byteLength]
-
-    def values(index):
-        accessor = file.accessors[index]
-        kind = {pygltflib.FLOAT: "<f4", pygltflib.UNSIGNED_INT: "<u4"}[accessor.componentType]
-        return np.frombuffer(view(accessor.bufferView), kind).reshape(accessor.count, -1)
-
-    (primitive,) = file.meshes[0].primitives
-    faces = values(primitive.indices).reshape(-1, 3)
+    file = Glb(written / "a.glb")
     names = ("POSITION", "NORMAL", "TANGENT", "TEXCOORD_0")
-    corners = [values(getattr(primitive.attributes, name))[faces] for name in names]
+    corners = [file.values(name)[file.values("faces")] for name in names]
     assert ((corners[3] >= 0) & (corners[3] <= 1)).all()
     np.testing.assert_allclose(np.linalg.norm(corners[1], axis=2), 1, atol=1e-5)
     # The middle of each face as a renderer shades it
     position, normal, tangent, uv = (c.mean(1) for c in corners)
-    pictures = []
-    for image in file.images:
-        assert image.mimeType == "image/png"
-        pictures.append(np.asarray(Image.open(io.BytesIO(view(image.bufferView)))))
-        assert pictures[-1].shape == (SIZE, SIZE, 3)
-        assert pictures[-1].dtype == np.uint8
-    material = file.materials[0]
+    pictures = [picture for _, _, picture in file.pictures()]
+    assert {kind for kind, _, _ in file.pictures()} == {"image/png"}
+    assert {picture.shape for picture in pictures} == {(SIZE, SIZE, 3)}
+    material = file.file.materials[0]
     assert material.pbrMetallicRoughness.metallicFactor == 0
     texel = [
         looked_up(pictures[slot.index] / 255, *uv.T)
@@ -201,9 +184,9 @@ def test_the_validator_of_khronos_has_nothing_to_say(written):
     assert json.loads(run.stdout)["messages"] == []
 
 
-def test_defaults(tmp_path, scene, monkeypatch):
+def test_defaults(tmp_path, balls, monkeypatch):
     """All faces without textures, fewer with; the same shape."""
-    monkeypatch.setattr("univoxel.scene.load_scene", lambda run: scene)
+    monkeypatch.setattr("univoxel.scene.load_scene", lambda run: balls)
     monkeypatch.setattr(task, "TEXTURED_FACES", 500)
     task.export("run", tmp_path / "a.PLY")
     task.export("run", tmp_path / "a.glb", texture_size=64)
@@ -251,11 +234,7 @@ def test_what_the_box_cuts_is_closed(tmp_path, monkeypatch):
         ),
         ("a.glb", {"lods": -1}, "lods must be from 0 to 8, got -1"),
         ("a.glb", {"lods": 9}, "lods must be from 0 to 8, got 9"),
-        (
-            "a.glb",
-            {"lods": 3, "faces": 2000},
-            "lods=3 with 2000 faces leaves 31 faces in the coarsest",
-        ),
+        ("a.glb", {"lods": 3, "faces": 2000}, "lods=3 with 2000 faces leaves 31 faces in the c"),
     ],
 )
 def test_bad_arguments(tmp_path, name, options, message):
@@ -263,13 +242,155 @@ def test_bad_arguments(tmp_path, name, options, message):
         task.export(tmp_path, tmp_path / name, **options)
 
 
-def test_errors_leave_nothing_behind(tmp_path, scene, monkeypatch):
+def test_errors_leave_nothing_behind(tmp_path, balls, monkeypatch):
     with pytest.raises(FileNotFoundError, match="not a trained run"):
         task.export(tmp_path, tmp_path / "mesh.ply")
-    monkeypatch.setattr("univoxel.scene.load_scene", lambda run: scene)
+    monkeypatch.setattr("univoxel.scene.load_scene", lambda run: balls)
     with pytest.raises(ValueError, match="without spaces"):
         task.export("run", tmp_path / "a b.obj", faces=100, texture_size=64)
     (tmp_path / "a.glb").mkdir()
     with pytest.raises(OSError, match=r"a\.glb"):
         task.export("run", tmp_path / "a.glb", faces=100, texture_size=64)
     assert [p.name for p in tmp_path.iterdir()] == ["a.glb"]
+
+
+# Size, origin, levels of detail and JPEG textures
+
+UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # rows of glTF times this: our world
+
+
+@pytest.fixture
+def export(tmp_path, balls, monkeypatch):
+    monkeypatch.setattr("univoxel.scene.load_scene", lambda run: balls)
+
+    def write(name, run="run", **options):
+        chosen: dict[str, Any] = {"texture_size": 64, "faces": 500} | options
+        return task.export(run, tmp_path / name, **chosen)
+
+    return write
+
+
+def vertices(path):
+    mesh = trimesh.load(path, force="mesh", process=False)
+    return mesh.vertices @ UPRIGHT if path.suffix == ".glb" else np.asarray(mesh.vertices)
+
+
+@pytest.mark.parametrize("suffix", ["glb", "obj", "ply"])
+@pytest.mark.parametrize("origin", ["upright", "world", "bottom", "centre"])
+def test_size_and_origin(export, suffix, origin):
+    """True to 1e-6 of the size; PLY and GLB hold 24 bits, OBJ 7 digits."""
+    (plain,) = export(f"plain.{suffix}")
+    (moved,) = export(f"moved.{suffix}", size=0.3, origin=origin)
+    before, after = vertices(plain), vertices(moved)
+    low, high = after.min(0), after.max(0)
+    assert (high - low).max() == pytest.approx(0.3, abs=0.3e-6)
+    scale = 0.3 / (before.max(0) - before.min(0)).max()
+    if origin in ("upright", "world"):
+        expected = scale * before
+    else:
+        middle = (before.min(0) + before.max(0)) / 2
+        bottom = np.array([*middle[:2], before[:, 2].min()])
+        expected = scale * (before - (bottom if origin == "bottom" else middle))
+        np.testing.assert_allclose((low + high)[:2] / 2, 0, atol=0.3e-6)
+        at_zero = low[2] if origin == "bottom" else (low + high)[2] / 2
+        assert at_zero == pytest.approx(0, abs=0.3e-6)
+    np.testing.assert_allclose(after, expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", ["glb", "obj", "ply"])
+def test_the_data_set_s_own_world(export, suffix, tmp_path):
+    """Vertices, normals and the frame of the normal map are turned back, where it is asked for."""
+    turn = Rotation.from_rotvec([2.0, -0.5, 0.7])
+    save_world(np.column_stack([turn.as_matrix(), [0.5, -1.0, 2.0]]), tmp_path)
+    (plain,) = export(f"plain.{suffix}", run=tmp_path)
+    (world,) = export(f"world.{suffix}", run=tmp_path, origin="world")
+    before, after = vertices(plain), vertices(world)
+    expected = turn.inv().apply(before - [0.5, -1.0, 2.0])
+    np.testing.assert_allclose(after, expected, rtol=0, atol=2e-6)
+    if suffix == "glb":
+        for name in ("NORMAL", "TANGENT"):
+            old, new = (Glb(path).values(name)[:, :3] @ UPRIGHT for path in (plain, world))
+            np.testing.assert_allclose(new, turn.inv().apply(old), atol=2e-6)
+    save_world(np.column_stack([np.eye(3), [0.0, -5.8e6, 0.0]]), tmp_path)
+    with pytest.raises(UserError, match="from the origin, which is too far"):
+        export(f"far.{suffix}", run=tmp_path, origin="world")
+
+
+def test_nothing_moves_unasked(export, balls):
+    (file,) = export("a.ply", faces=None)
+    found, wanted = vertices(file), balls.field.isosurface()[0].numpy()
+    bounds = [wanted.min(0), wanted.max(0)]
+    np.testing.assert_allclose([found.min(0), found.max(0)], bounds, atol=1e-6)
+
+
+def test_jpeg_textures(export, tmp_path):
+    """What JPEG leaves is near what PNG holds, nearer at higher quality, and smaller."""
+    exact = Glb(*export("exact.glb", texture_size=256)).pictures()
+    errors, sizes = [], [sum(size for _, size, _ in exact)]
+    for quality in (95, 90, 30):
+        lossy = export("lossy.glb", texture_size=256, texture_format="jpeg", quality=quality)
+        both = list(zip(exact, Glb(*lossy).pictures(), strict=True))
+        assert {(a[0], b[0]) for a, b in both} == {("image/png", "image/jpeg")}
+        errors.append([np.abs(a[2] - b[2]).mean() for a, b in both])
+        sizes.append(sum(b[1] for _, b in both))
+    assert sizes == sorted(sizes, reverse=True)
+    # Steps of the tables at quality 90 are 3 to 24: a mean error of a step's quarter at most, 2 %
+    assert max(errors[1]) < 4
+    assert all((np.diff(errors, axis=0) >= 0).ravel())
+    export("a.obj", texture_format="jpeg")
+    names = [f"a_{kind}.jpg" for kind in ("albedo", "normal", "roughness")]
+    assert sorted(p.name for p in tmp_path.glob("a_*")) == names
+    assert all((tmp_path / name).read_bytes().startswith(b"\xff\xd8\xff") for name in names)
+    text = (tmp_path / "a.mtl").read_text()
+    assert all(name in text for name in names)
+    assert ".png" not in text
+
+
+def test_levels_of_detail(export, tmp_path):
+    """A quarter of the triangles each, half the texels a side, the same shape in the same place."""
+    files = export("a.glb", faces=4000, texture_size=64, lods=3, size=2.0, origin="bottom")
+    assert [f.name for f in files] == ["a.glb", "a_lod1.glb", "a_lod2.glb", "a_lod3.glb"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(f.name for f in files)
+    meshes = [trimesh.load(f, force="mesh") for f in files]
+    counts = [len(mesh.faces) for mesh in meshes]
+    for level, count in enumerate(counts):
+        most = 4000 // 4**level
+        assert 0.85 * most <= count <= most, counts
+    assert [len(Glb(f).pictures()[0][2]) for f in files] == [64, 32, 16, 16]
+    full = silhouette(meshes[0])
+    for level, mesh in enumerate(meshes[1:], 1):
+        now = silhouette(mesh)
+        # Edges of a ball of F triangles sag by about (their length)^2 / 8 r, 1/F of its radius
+        assert (now & full).sum() / (now | full).sum() > 1 - 20 / counts[level]
+    assert len(np.unique([silhouette(m).sum() for m in meshes])) > 1
+    assert [f.name for f in export("b.ply", lods=1)] == ["b.ply", "b_lod1.ply"]
+    export("c.obj", lods=1)
+    assert "c_lod1" not in (tmp_path / "c.mtl").read_text()
+    assert "c_lod1_albedo.png" in (tmp_path / "c_lod1.mtl").read_text()
+
+
+def silhouette(mesh):
+    """What rays along -z of a file's axes meet, over the object's box: [K, K] bool."""
+    places, faces = (torch.tensor(np.asarray(x)) for x in (mesh.vertices, mesh.faces))
+    scene = VisibilityScene(places.float(), faces.int())
+    line = torch.linspace(-1.2, 1.2, 400)
+    x, y = torch.meshgrid(line, line + 1, indexing="xy")
+    origin = torch.stack([x, y, torch.full_like(x, 5.0)], -1).reshape(-1, 3)
+    direction = torch.tensor([0.0, 0.0, -1.0]).expand_as(origin).contiguous()
+    return (scene.closest_hit(origin, direction).face >= 0).reshape(400, 400).numpy()
+
+
+def test_levels_need_triangles(export, tmp_path):
+    """Of the surface itself, too, where it has fewer than were allowed."""
+    said = r"lods=8 with \d+ faces leaves 0 faces in the coarsest"
+    with pytest.raises(UserError, match=said) as caught:
+        export("a.ply", faces=None, lods=8)
+    assert caught.value.arguments == ("lods",)
+    assert not list(tmp_path.iterdir())
+
+
+def test_watertight_levels(tmp_path, monkeypatch):
+    cut = lopsided(24**3, change=lambda nodes, sdf: nodes.norm(dim=-1) - 0.55)
+    monkeypatch.setattr("univoxel.scene.load_scene", lambda run: cut)
+    for file in task.export("run", tmp_path / "a.ply", faces=800, watertight=True, lods=2):
+        assert trimesh.load(file).is_watertight, file

@@ -76,9 +76,8 @@ def test_the_truth_goes_beside(tmp_path, data):
     scene = a_run(tmp_path, folder, EnvmapConfig(rows=32))
     map = scene.light.latlong(32).detach() * (1 + latlong_directions(32)[..., 2:])
     (folder / "envmaps").mkdir()
-    write_exr(
-        folder / "envmaps" / "train.exr", dict(zip("RGB", map.unbind(2), strict=True)), half=False
-    )
+    channels = dict(zip("RGB", map.unbind(2), strict=True))
+    write_exr(folder / "envmaps" / "train.exr", channels, half=False)
     assert inspect(tmp_path, "0", (16, 16), height=32)  # a map alone is no truth
     exr = tmp_path / "inspect" / "r_0_16_16.exr"
     assert "truth.R" not in read_exr(exr)
@@ -87,11 +86,13 @@ def test_the_truth_goes_beside(tmp_path, data):
     normal, _ = sphere_normals(cameras_around(2), 0)
     cosine = latlong_directions(32) @ normal[16, 16]
     above = cosine > 0.2  # facets of the mesh are tilted against the ball
-    torch.testing.assert_close(
-        channel(exr, "truth.G")[above], map[..., 1][above], rtol=1e-4, atol=1e-5
-    )
+    found = channel(exr, "truth.G")[above]
+    torch.testing.assert_close(found, map[..., 1][above], rtol=1e-4, atol=1e-5)
     assert bool((channel(exr, "truth.open")[cosine < -0.2] == 0).all())
     assert torch.equal(channel(exr, "truth.open")[above], channel(exr, "map.open")[above])
+    (folder / "mesh.ply").write_text("nothing")
+    with pytest.raises(DataError, match=r"mesh\.ply: expected a binary little-endian PLY"):
+        inspect(tmp_path, "0", (16, 16))
 
 
 def test_irradiance_of_an_even_sky():
@@ -99,13 +100,6 @@ def test_irradiance_of_an_even_sky():
     for normal in ([0.0, 0, 1], [0.6, 0, -0.8]):
         found = irradiance(even, torch.tensor(normal))
         torch.testing.assert_close(found, torch.full((3,), 0.7 * torch.pi), rtol=1e-3, atol=0)
-
-
-def test_pixels_as_they_are_written():
-    assert parse_pixel("12,34") == (12, 34)
-    for text in ("12", "a,b", "1,2,3", "1.5,2"):
-        with pytest.raises(ValueError, match=f"pixel: expected COLUMN,ROW, got '{text}'"):
-            parse_pixel(text)
 
 
 @pytest.mark.parametrize(
@@ -127,13 +121,7 @@ def test_bad_arguments(tmp_path, data, arguments, message):
     with pytest.raises(ValueError, match=message.replace("got a", "got .*a")):
         inspect(tmp_path, view, pixel, out, *rest[1:])
     assert not (tmp_path / "inspect").exists()
-
-
-def test_a_true_mesh_that_is_none(tmp_path, data):
-    folder = Path(shutil.copytree(data, tmp_path / "data"))
-    a_run(tmp_path, folder)
-    (folder / "envmaps").mkdir()
-    write_exr(folder / "envmaps" / "train.exr", {c: torch.ones(4, 8) for c in "RGB"}, half=False)
-    (folder / "mesh.ply").write_text("nothing")
-    with pytest.raises(DataError, match=r"mesh\.ply: expected a binary little-endian PLY"):
-        inspect(tmp_path, "0", (16, 16))
+    assert parse_pixel("12,34") == (12, 34)
+    for text in ("12", "a,b", "1,2,3", "1.5,2"):
+        with pytest.raises(ValueError, match=f"pixel: expected COLUMN,ROW, got '{text}'"):
+            parse_pixel(text)

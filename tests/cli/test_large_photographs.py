@@ -48,6 +48,11 @@ def test_what_was_found_is_remembered(tmp_path, large, read, monkeypatch):
     evaluate(run)
     assert len(read) == 8
     assert {kept_photos(run, s).is_file() for s in ("train", "test")} == {True}
+    # Other data do not take the place of what was kept
+    other = write_scene(tmp_path / "other", 6)
+    before = kept_photos(run, "train").read_bytes()
+    assert photos_of(run, other, "train").cameras.width == 16
+    assert kept_photos(run, "train").read_bytes() == before
     # Whatever would be found now, the run goes by what was
     monkeypatch.setattr(load_images, "FINE", 8)
     assert photos_of(run).cameras.width == 16
@@ -57,25 +62,12 @@ def test_what_was_found_is_remembered(tmp_path, large, read, monkeypatch):
     train(dataclasses.replace(cfg, downscale=2), resume=True)
 
 
-def test_other_data_do_not_take_the_place_of_what_was_kept(tmp_path, large, read):
-    run = train(config(tmp_path))
-    other = write_scene(tmp_path / "other", 6)
-    before = kept_photos(run, "train").read_bytes()
-    assert photos_of(run, other, "train").cameras.width == 16
-    assert kept_photos(run, "train").read_bytes() == before
-
-
-def test_nothing_is_kept_of_what_is_as_it_was(tmp_path):
-    run = train(config(tmp_path))
-    assert json.loads((run / "config.json").read_text())["downscale"] == 1
-    evaluate(run)
-    assert not list(run.glob("photographs*"))
-
-
 @pytest.mark.parametrize("before", [0, None])
 def test_runs_from_before_kept_their_photographs_whole(tmp_path, large, before):
     """0 meant 1 then."""
     run = train(config(tmp_path, downscale=1))
+    evaluate(run)
+    assert not list(run.glob("photographs*"))  # of what is as it was nothing is kept
     path = run / "config.json"
     values = json.loads(path.read_text())
     del values["downscale"]

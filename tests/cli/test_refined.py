@@ -60,6 +60,19 @@ def test_turned_cameras_are_put_right(data, run):
     before, after = off(photos.cameras), off(load_scene(run).registered(photos).cameras)
     assert before.mean() > 1.0
     assert after.mean() < 0.3 * before.mean()
+    assert load_scene(run).cfg.refined
+    assert json.loads((run / "config.json").read_text())["cameras"] == "auto"
+
+
+def test_cameras_that_agree_or_are_given_stay_as_they_are(data, tmp_path, caplog):
+    caplog.set_level("INFO", "univoxel")
+    right = write_scene(tmp_path / "data")
+    for folder, cameras in ((right, "auto"), (data, "given")):
+        cfg = config(folder, tmp_path / cameras, cameras)
+        assert load_scene(train(replace(cfg, stages=cfg.stages[:1]))).poses is None
+        if cameras == "auto":
+            assert "inconsistent" not in caplog.text
+    assert "pixels: try cameras=refined" in caplog.text
 
 
 def test_geometry_is_the_sphere_again(data, run, tmp_path):
@@ -67,30 +80,8 @@ def test_geometry_is_the_sphere_again(data, run, tmp_path):
         (extract_mesh(load_scene(r)).vertices.norm(dim=1) - RADIUS).abs().mean()
         for r in (run, train(config(data, tmp_path / "run", cameras="given")))
     ]
-    assert away[0] < 0.03  # as from the true cameras, see test_train.py
+    assert away[0] < 0.03  # as from the true cameras, see test_train
     assert away[1] > away[0]
-
-
-def test_the_run_keeps_its_cameras(data, run):
-    kept = load_scene(run)
-    assert kept.cfg.refined
-    assert kept.poses.steps.abs().max() > 1e-3
-    assert json.loads((run / "config.json").read_text())["cameras"] == "auto"
-
-
-def test_cameras_that_agree_stay_as_they_are(tmp_path, caplog):
-    data = write_scene(tmp_path / "data")
-    cfg = replace(config(data, tmp_path / "run"), stages=config(data, tmp_path).stages[:1])
-    caplog.set_level("INFO", "univoxel")
-    assert load_scene(train(cfg)).poses is None
-    assert "inconsistent" not in caplog.text
-
-
-def test_given_cameras_are_only_complained_about(data, tmp_path, caplog):
-    cfg = config(data, tmp_path / "run", cameras="given")
-    caplog.set_level("INFO", "univoxel")
-    assert load_scene(train(replace(cfg, stages=cfg.stages[:1]))).poses is None
-    assert "pixels: try cameras=refined" in caplog.text
 
 
 def test_a_refined_run_is_resumed(data, tmp_path, monkeypatch):

@@ -107,12 +107,13 @@ def test_exposure_and_several_maps(run):
                      for s in ("exr", "png")]  # fmt: skip
     white, dim = (read_exr(run / "out" / m / "r_0.exr")["rgb.G"].sum() for m in ("white", "dim"))
     assert dim == pytest.approx(white / 4, rel=1e-2)
-    assert white > frames_sum(run) * 1.9
-
-
-def frames_sum(run):
     frames(run, out="plain")
-    return read_exr(run / "plain" / "r_0.exr")["rgb.G"].sum()
+    plain = read_exr(run / "plain" / "r_0.exr")
+    assert white > plain["rgb.G"].sum() * 1.9
+    frames(run, out="small", resolution=12)
+    small = read_exr(run / "small" / "r_0.exr")["alpha"]
+    assert small.shape == (12, 12)
+    assert small.mean() == pytest.approx(plain["alpha"].mean(), abs=0.06)
 
 
 def test_rotation_moves_the_light(run):
@@ -154,26 +155,6 @@ def test_orbit_sees_all_of_the_object(run):
         assert torch.det(pose) > 0
 
 
-def test_resolution_scales_the_views(run):
-    frames(run, resolution=12)
-    small = read_exr(run / "out" / "r_0.exr")["alpha"]
-    assert small.shape == (12, 12)
-    frames(run, out="large")
-    large = read_exr(run / "large" / "r_0.exr")["alpha"]
-    assert small.mean() == pytest.approx(large.mean(), abs=0.06)
-
-
-def test_test_views_come_from_the_data_of_the_run(run):
-    with pytest.raises(DataError, match=r"a run, but config\.json is missing"):
-        frames(run, cameras="test")
-    (run / "run" / "config.json").write_text("{}")
-    with pytest.raises(DataError, match=r"config\.json: expected data to be a folder"):
-        frames(run, cameras="test")
-    (run / "run" / "config.json").write_text(json.dumps({"data": str(run / "none")}))
-    with pytest.raises(DataError, match="none"):
-        frames(run, cameras="test")
-
-
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
@@ -200,7 +181,7 @@ def test_bad_arguments(run, options, error, message):
         frames(run, **options)
 
 
-def test_bad_maps_and_cameras_name_the_file(run):
+def test_bad_files_are_named(run):
     write_exr(run / "square.exr", {c: torch.ones(4, 4) for c in "RGB"})
     with pytest.raises(DataError, match=r"square\.exr: .*with W = 2 H, got \[4, 4, 3\]"):
         frames(run, maps="square")
@@ -212,6 +193,16 @@ def test_bad_maps_and_cameras_name_the_file(run):
         (run / "bad.json").write_text(content)
         with pytest.raises(DataError, match=rf"bad\.json.*{message}"):
             frames(run, cameras=str(run / "bad.json"))
+    config = run / "run" / "config.json"
+    with pytest.raises(DataError, match=r"a run, but config\.json is missing"):
+        frames(run, cameras="test")
+    for content, message in (
+        ("{}", r"config\.json: expected data to be a folder"),
+        (json.dumps({"data": str(run / "none")}), "none"),
+    ):
+        config.write_text(content)
+        with pytest.raises(DataError, match=message):
+            frames(run, cameras="test")
 
 
 def test_light_turns_under_a_still_camera(run):
@@ -234,12 +225,6 @@ def test_suns_alone_and_a_floor(run):
     assert set(layers["shadow"].ravel().tolist()) == {0.0, 1.0}  # a hard sun: all or nothing
 
 
-def test_options_that_are_none(run):
-    where = run / "run", None, str(run / "cameras.json")
-    with pytest.raises(TypeError, match="moons"):
-        task.relight_images(*where, moons=[])
-
-
 def test_pictures_as_tensors(run):
     white = EnvMap(torch.ones(4, 8, 3))
     made = task.relight_images(run / "run", white, str(run / "cameras.json"), samples=8, noise=0.2)
@@ -253,6 +238,8 @@ def test_pictures_as_tensors(run):
     assert again.shape == (2, 16, 16, 4)
     assert again[..., 3].eq(1).all()
     torch.testing.assert_close(again[:, 0, 0, :3], torch.ones(2, 3))
+    with pytest.raises(TypeError, match="moons"):
+        task.relight_images(run / "run", None, str(run / "cameras.json"), moons=[])
 
 
 def test_a_killed_run_leaves_no_half_frames(run, monkeypatch):

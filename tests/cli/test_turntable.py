@@ -53,11 +53,10 @@ def turned_lamps() -> torch.Tensor:
     """What the lamps are in the world of each photograph: [V, D, 3]."""
     map = lamps(NODES)
     turn = TURNTABLE.turn(cameras_around(VIEWS).camera_to_world[:, :, 3])
-    return resampling(torch.nn.functional.normalize(sky_directions(), dim=1), turn) @ map
-
-
-def sky_directions() -> torch.Tensor:
-    return sphere_scene(NODES).sky.direction
+    return (
+        resampling(torch.nn.functional.normalize(sphere_scene(NODES).sky.direction, dim=1), turn)
+        @ map
+    )
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +90,9 @@ def test_light_of_its_own_for_each_photograph_is_found(monkeypatch):
     """Lamps that are turned at random from photograph to photograph; exposures are no light."""
     generator = torch.Generator().manual_seed(1)
     turn = torch.stack([random_rotation(generator) for _ in range(VIEWS)])
-    maps = resampling(torch.nn.functional.normalize(sky_directions(), dim=1), turn) @ lamps(NODES)
+    maps = resampling(
+        torch.nn.functional.normalize(sphere_scene(NODES).sky.direction, dim=1), turn
+    ) @ lamps(NODES)
     differ, still = photographs_under(maps, 0.3, VIEWS), photographs_under(lamps(NODES), 0.3, VIEWS)
     gains = torch.linspace(-0.5, 0.5, VIEWS)[torch.randperm(VIEWS, generator=generator)]
     linear = srgb_to_linear(still.color.float() / 255) * (gains - 0.5).exp()[:, None, None, None]
@@ -140,22 +141,18 @@ def test_what_decides(photographs, monkeypatch, caplog, still_around, ahead, sav
         assert "(fixed light: 0 %)" in caplog.text
 
 
-def test_what_is_known_is_not_looked_for(photographs):
-    photos = photographs["still"]
-    assert light_frame_of(photos, *hull_of(photos), "turntable").turntable == TURNTABLE
-    assert light_frame_of(photographs["turning"], *hull_of(photos), "world") == LightFrame()
-
-
 def test_a_turntable_without_an_axis(photographs):
     photos = photographs["still"]
     pose = photos.cameras.camera_to_world.clone()
-    pose[::2, :, :2] = torch.stack(
-        [pose[::2, :, 1], -pose[::2, :, 0]], 2
-    )  # every other on its side
+    # Every other on its side
+    pose[::2, :, :2] = torch.stack([pose[::2, :, 1], -pose[::2, :, 0]], 2)
     tumbled = replace(photos, cameras=replace(photos.cameras, camera_to_world=pose))
     with pytest.raises(DataError, match="light_frame=turntable needs cameras around one"):
         light_frame_of(tumbled, *hull_of(photos), "turntable")
     assert light_frame_of(tumbled, *hull_of(photos), "auto") == LightFrame()
+    # What is known is not looked for
+    assert light_frame_of(photos, *hull_of(photos), "turntable").turntable == TURNTABLE
+    assert light_frame_of(photographs["turning"], *hull_of(photos), "world") == LightFrame()
 
 
 def test_the_equations_see_the_map_as_the_renders_do():
@@ -230,17 +227,9 @@ def test_both_renders_follow_the_camera():
     eye = cameras_around(VIEWS).camera_to_world[:, :, 3]
     turn = TURNTABLE.turn(eye)
     here = torch.nn.functional.normalize(torch.tensor([[0.5, 0.2, 0.6]]), dim=1).expand(VIEWS, 3)
-    normal, wo = (
-        rotated(turn.transpose(1, 2), x) for x in (here, here)
-    )  # as the first camera sees it
-    depth = torch.full((VIEWS,), 2.0)
-    surface = surface_at(
-        eye - depth[:, None] * wo,
-        normal,
-        roughness=0.3,
-        features=torch.zeros(VIEWS, 4),
-        depth=depth,
-    )
+    wo = rotated(turn.transpose(1, 2), here)  # as the first camera sees it
+    at = {"features": torch.zeros(VIEWS, 4), "depth": torch.full((VIEWS,), 2.0)}
+    surface = surface_at(eye - 2.0 * wo, wo, roughness=0.3, **at)
     still = sphere_scene(NODES).eval()
     with torch.no_grad():
         for render in (radiance_of, shade):
@@ -260,18 +249,9 @@ def test_a_checkpoint_keeps_the_axes(laid, tmp_path):
     scene = sphere_scene(NODES)
     save_scene(Scene(replace(scene.cfg, turntable=kept), scene.field, scene.inv_s), tmp_path, {})
     assert load_scene(tmp_path).cfg.turntable == kept
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        (
-            {"light": EnvmapConfig()},
-            "needs light=hybrid, sg, sh or mlp, got envmap",
-        ),
+    for changes, message in (
+        ({"light": EnvmapConfig()}, "needs light=hybrid, sg, sh or mlp, got envmap"),
         ({"varying": "light"}, "cannot also differ"),
-    ],
-)
-def test_what_does_not_go_with_a_turntable(changes, message):
-    with pytest.raises(ConfigError, match=message):
-        replace(sphere_scene(NODES).cfg, turntable=TURNTABLE, **changes)
+    ):
+        with pytest.raises(ConfigError, match=message):
+            replace(scene.cfg, turntable=TURNTABLE, **changes)

@@ -241,10 +241,8 @@ def test_the_light_of_a_view_from_the_command_line(tmp_path, capsys):
     place = ["--view", "0", "--pixel", "8,8"]
     for command in (["eval"], ["inspect", *place]):
         assert main([command[0], str(run), *command[1:], "--light-of", "r_2"]) == 0
+    said = "--light-of: expected the number of a view (below 6) or its name (from r_0 to r_5)"
     for command in (["eval"], ["inspect", *place], ["envmap", "--out", str(tmp_path / "a.exr")]):
         capsys.readouterr()
         assert main([command[0], str(run), *command[1:], "--light-of", "r_9"]) == 2
-        assert (
-            "--light-of: expected the number of a view (below 6) or its name (from r_0 to r_5)"
-            in (capsys.readouterr().err)
-        )
+        assert said in capsys.readouterr().err

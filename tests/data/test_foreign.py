@@ -1,26 +1,15 @@
-"""Lists of photographs as other machines and programs write them: the same as without."""
+"""Lists of photographs as other programs write them, and pictures that are not there."""
 
 import json
+import logging
 import re
 import unicodedata
 
+import layouts
 import numpy as np
 import pytest
 import torch
-from layouts import (
-    FOCAL,
-    HEIGHT,
-    WIDTH,
-    scene,
-    write_colmap,
-    write_idr,
-    write_llff,
-    write_metashape,
-    write_nerf,
-    write_nerfstudio,
-    write_polycam,
-    write_realitycapture,
-)
+from layouts import FOCAL, HEIGHT, WIDTH, scene, write_colmap, write_nerf, write_nerfstudio
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -151,26 +140,26 @@ def views(photos):
         yield color.numpy().tobytes(), [alpha, *camera]
 
 
+SEMICOLONS = ((r"\.", "!"), (",", ";"), ("!", ","), (",png", ".png"))
 CASES = [
-    *((write_nerfstudio, name, change) for name, change in OF_NERFSTUDIO.items()),
-    *((lambda *a: write_colmap(*a, text=True), name, change) for name, change in OF_COLMAP.items()),
-    (
-        write_realitycapture,
-        "semicolons",
-        text("cameras.csv", (r"\.", "!"), (",", ";"), ("!", ","), (",png", ".png")),
-    ),
-    (write_realitycapture, "tabs in UTF-16", text("cameras.csv", (",", "\t"), encoding="utf-16")),
-    (write_metashape, "groups", groups),
-    (write_idr, "unpadded", unpadded("{}.png")),
-    (write_idr, "unpadded with a word", unpadded("view_{}_a.png")),
-    (write_llff, "more pictures than rows", more_pictures),
+    *(("nerfstudio", name, change) for name, change in OF_NERFSTUDIO.items()),
+    *(("colmap", name, change) for name, change in OF_COLMAP.items()),
+    ("realitycapture", "semicolons", text("cameras.csv", *SEMICOLONS)),
+    ("realitycapture", "tabs in UTF-16", text("cameras.csv", (",", "\t"), encoding="utf-16")),
+    ("metashape", "groups", groups),
+    ("idr", "unpadded", unpadded("{}.png")),
+    ("idr", "unpadded with a word", unpadded("view_{}_a.png")),
+    ("llff", "more pictures than rows", more_pictures),
 ]
 
 
-@pytest.mark.parametrize(("writer", "name", "change"), CASES, ids=[c[1] for c in CASES])
-def test_lists_are_read_as_they_were_meant(tmp_path, writer, name, change):
-    written = scene(10)
-    plain, data = writer(tmp_path / "plain", written), writer(tmp_path / "data", written)
+@pytest.mark.parametrize(("layout", "name", "change"), CASES, ids=[c[1] for c in CASES])
+def test_lists_are_read_as_they_were_meant(tmp_path, layout, name, change):
+    options = {"text": True} if layout == "colmap" else {}
+    plain, data = (
+        getattr(layouts, f"write_{layout}")(tmp_path / place, scene(10), **options)
+        for place in ("plain", "data")
+    )
     change(data)
     found, wanted = (
         {color: view for split in SPLITS for color, view in views(load_photos(folder, split))}
@@ -204,17 +193,14 @@ def test_pictures_of_one_name_in_two_folders(tmp_path):
     assert view_names(["a/0.png", "b/1.png"]) == ["0", "1"]
 
 
-@pytest.mark.parametrize(
-    "writer",
-    [write_nerfstudio, write_llff, write_colmap, write_metashape, write_realitycapture],
-)
-def test_coordinates_of_the_earth(tmp_path, writer):
+@pytest.mark.parametrize("layout", ["nerfstudio", "llff", "colmap", "metashape", "realitycapture"])
+def test_coordinates_of_the_earth(tmp_path, layout):
     """Distances between cameras stay as exact as float32 has them, in every layout."""
     written = scene()
     far = scene()
     far.poses[:, :3, :3] = Rotation.from_matrix(far.poses[:, :3, :3]).as_matrix()
     far.poses[:, :3, 3] += (391234.5, 5.82e6, 34.0)
-    photos = load_photos(writer(tmp_path, far))
+    photos = load_photos(getattr(layouts, f"write_{layout}")(tmp_path, far))
     assert re.search(r"world moved by -39123\d -5820000 -3\d", photos.about)
     place = photos.cameras.camera_to_world[:, :, 3]
     wanted = torch.from_numpy(written.poses[written.split("train"), :3, 3]).float()
@@ -236,76 +222,92 @@ def test_splits_of_a_far_world_are_moved_as_one(tmp_path):
         assert photos.moved is not None
 
 
-def test_a_lens_of_larger_pictures_is_told(tmp_path, caplog):
-    """Where no size says so: cx and cy would be those of a corner."""
-    data = write_nerfstudio(tmp_path, scene())
+def test_what_is_odd_is_told(tmp_path, caplog):
+    """One photograph; a lens of larger pictures, where no size says so: cx and cy would be those of
+    a corner."""
+    load_photos(write_nerfstudio(tmp_path / "one", scene(2), test_filenames=["images/p_000.png"]))
+    assert "one photograph is not enough for a shape: at least 3" in caplog.text
+    data = write_nerfstudio(tmp_path / "data", scene())
     load_photos(data)
-    assert "at the border" not in caplog.text
+    assert "beyond the border" not in caplog.text
     text("transforms.json", ('"w": 12, ', ""), ('"h": 8, ', ""))(data)
     text("transforms.json", (r'"cx": [\d.]+', '"cx": 12.0'), (r'"cy": [\d.]+', '"cy": 8.0'))(data)
     load_photos(data)
     assert "cx and cy are near or beyond the border of the 12x8 images" in caplog.text
 
 
-def no_images(place, other):
-    return lambda folder: (folder / place).rename(folder / other)
+# Pictures that are listed and not there are left out and counted, as long as enough remain
 
 
-def two_fit(folder):
-    for path in list((folder / "images").iterdir()):
-        path.rename(path.with_name(path.name.replace("p_", "P_")))
-        (path.with_name(path.name.replace(".png", ".pNg"))).write_bytes(b"")
+def places(writer, v):
+    """The picture of view v in a layout."""
+    split = "test" if v % 8 == 0 else "train"
+    return f"{split if writer is write_nerf else 'images'}/p_00{v}.png"
 
 
-@pytest.mark.parametrize(
-    ("writer", "change", "message"),
-    [
-        (
-            write_nerfstudio,
-            two_fit,
-            r"images/p_009\.png, got .*P_009\.png and .*p_009\.pNg: rename",
-        ),
-        (
-            write_nerfstudio,
-            text("transforms.json", ("images/p", "/a/../images/p")),
-            "10 of 10",
-        ),
-        (
-            write_nerfstudio,
-            no_images("images", "images_2"),
-            "images_2 exists: rename it to images, so that cameras are scaled",
-        ),
-        (
-            write_polycam,
-            lambda f: (f / "keyframes/corrected_images").rename(f / "keyframes/images"),
-            "corrected_images; the images in .*keyframes/images belong to .* in .*/cameras",
-        ),
-        (
-            write_nerfstudio,
-            text("transforms.json", ('"k1": 0.0', '"k5": 0.1')),
-            "expected only distortion terms k1 k2 k3 p1 p2, got k5",
-        ),
-        (
-            lambda f, s: write_colmap(
-                f, s, "sparse/0", True, "FULL_OPENCV", (*[9] * 4, *[0.1] * 8)
-            ),
-            lambda f: None,
-            "got FULL_OPENCV with k4, k5 or k6 for camera 3: run",
-        ),
-    ],
-)
-def test_what_helps_is_said(tmp_path, writer, change, message):
-    change(writer(tmp_path, scene()))
-    with pytest.raises(DataError, match=message):
-        load_photos(tmp_path)
+@pytest.mark.parametrize("writer", [write_colmap, write_nerf, write_nerfstudio])
+def test_pictures_that_are_not_there_are_left_out(tmp_path, writer, caplog):
+    data = writer(tmp_path, scene())
+    assert "left out" not in load_photos(data).about
+    assert not caplog.messages
+    lost = (2, 5, 6)
+    for v in lost:
+        (data / places(writer, v)).unlink()
+    with caplog.at_level(logging.WARNING, "univoxel"):
+        photos = load_photos(data)
+    listed = 8 if writer is write_nerf else 10  # which has a file for each split
+    assert f"3 of {listed} listed images were left out" in photos.about
+    assert all(f"p_00{v}" in caplog.messages[0] for v in lost)
+    assert caplog.messages[0].endswith(f"(3 of {listed} left out)")
+    if writer is write_nerf:
+        assert photos.names == ["p_001", "p_003", "p_004", "p_007", "p_009"]
+        return
+    # Every eighth of those that are there
+    assert photos.names == ["p_001", "p_003", "p_004", "p_007", "p_008", "p_009"]
+    assert load_photos(data, "test").names == ["p_000"]
 
 
-def test_cameras_of_a_rig_are_named(tmp_path):
-    write_metashape(tmp_path, scene())
-    text("cameras.xml", ('label="not_placed"', 'label="right" master_id="0"'))(tmp_path)
-    assert "; 1 belong to a rig" in load_photos(tmp_path).about
+@pytest.mark.parametrize(("views", "lost", "enough"), [(3, 1, 0), (4, 1, 1), (8, 4, 1), (8, 5, 0)])
+def test_how_many_must_remain(tmp_path, views, lost, enough):
+    data = write_colmap(tmp_path, scene(views))
+    for v in range(lost):
+        (data / "images" / f"p_00{v}.png").unlink()
+    if enough:
+        assert f"{lost} of {views} listed" in load_photos(data).about
+        return
+    with pytest.raises(DataError, match=rf"images.bin: missing .*\({lost} of {views}\)"):
+        load_photos(data)
 
 
-def test_one_photograph_is_told(tmp_path, caplog):
-    load_photos(write_nerfstudio(tmp_path, scene(2), test_filenames=["images/p_000.png"]))
-    assert "one photograph is not enough for a shape: at least 3" in caplog.text
+def test_splits_that_name_what_is_not_there(tmp_path):
+    names = {"train_filenames": ["images/p_001.png", "images/p_002.png"]}
+    data = write_nerfstudio(tmp_path, scene(), **names, test_filenames=["images/p_003.png"])
+    (data / "images" / "p_002.png").unlink()
+    assert load_photos(data).names == ["p_001"]
+    (data / "images" / "p_003.png").unlink()
+    with pytest.raises(DataError, match="frames in test_filenames, found 0 of 1"):
+        load_photos(data, "test")
+
+
+@pytest.mark.parametrize("named", ["p_00{}", "p_00{}.jpg", "p_00{}.HEIC", "p_00{}.PNG"])
+@pytest.mark.parametrize("writer", [write_colmap, write_nerfstudio])
+def test_names_without_their_ending_or_with_another(tmp_path, writer, named):
+    """Photographs are converted after cameras were found; instant-ngp lists them without .png."""
+    data = writer(tmp_path, scene(), **({"text": True} if writer is write_colmap else {}))
+    file = data / ("sparse/0/images.txt" if writer is write_colmap else "transforms.json")
+    text = file.read_text()
+    for v in range(10):
+        old = f"images/p_00{v}.png" if writer is write_nerfstudio else f"p_00{v}.png"
+        text = text.replace(old, old[: -len(f"p_00{v}.png")] + named.format(v))
+    file.write_text(text)
+    assert load_photos(data).names == [f"p_00{v}" for v in (1, 2, 3, 4, 5, 6, 7, 9)]
+
+
+def test_a_dot_in_a_name_is_no_ending(tmp_path):
+    data = write_nerfstudio(tmp_path, scene())
+    root = json.loads((data / "transforms.json").read_text())
+    for k in (0, 1):  # p_009 and p_008
+        root["frames"][k]["file_path"] = f"images/p_0.{k}"
+    (data / "images" / "p_0.png").write_bytes((data / "images" / "p_001.png").read_bytes())
+    (data / "transforms.json").write_text(json.dumps(root))
+    assert "2 of 10 listed images were left out" in load_photos(data).about

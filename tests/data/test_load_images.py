@@ -1,4 +1,4 @@
-"""What all loaders share: size of photographs, masks, memory."""
+"""What all loaders share: size of photographs, masks, memory, pixels in linear float."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,9 +8,9 @@ import pytest
 import torch
 from layouts import HEIGHT, WIDTH, Scene, scene, write_colmap, write_nerf, write_nerfstudio
 
-from univoxel.camera import project
+from univoxel.camera import Cameras, project
 from univoxel.color import linear_to_srgb, srgb_to_linear
-from univoxel.data import load_images, load_photos, splits_of
+from univoxel.data import Photos, load_images, load_photos, splits_of
 from univoxel.data.images import write_exr, write_png
 from univoxel.data.lens import Lens
 from univoxel.data.load_images import Shot
@@ -80,10 +80,7 @@ def test_photographs_are_shrunk_to_what_grids_can_use(width, factor):
     shot = Shot("", "", Path(), None, np.eye(4)[:3], lens)
     set_ = [replace(shot, lens=lens), replace(shot, lens=across)] * 5
     assert load_images.fitting_downscale(set_) == factor
-
-
-def test_presets_use_no_more_than_photographs_are_shrunk_to():
-    """Even where the object fills no more than half of the longer side."""
+    # Presets use no more, even where the object fills no more than half of the longer side
     finest = max(1e6 * work.voxels for work in PRESETS.values())
     assert finest ** (1 / 3) < load_images.FINE / 2
 
@@ -108,23 +105,20 @@ def test_downscales_out_of_range(tmp_path):
         load_photos(tmp_path, downscale=9)
 
 
-def test_a_mask_beside_the_photograph(tmp_path):
+def test_a_mask_beside_the_photograph_or_in_a_folder_beside(tmp_path):
     written = scene(2)
+    write_nerf(tmp_path / "folder", written)
+    (tmp_path / "folder/test_mask").mkdir()
+    mask = np.full((HEIGHT, WIDTH), 209, np.uint8)
+    write_png(tmp_path / "folder/test_mask/p_000.png", mask)
+    assert load_photos(tmp_path / "folder", "test").alpha.unique().tolist() == [209]
+    assert np.array_equal(load_photos(tmp_path / "folder").alpha[0], written.pictures[1, ..., 3])
     write_nerf(tmp_path, written)
     for what in ("alpha", "mask"):  # the second is looked for first
         write_png(tmp_path / "test" / "p_000.png", written.pictures[0, ..., :3])
         write_png(tmp_path / "test" / f"p_000_{what}.png", np.full((HEIGHT, WIDTH), 209, np.uint8))
         assert load_photos(tmp_path, "test").alpha.unique().tolist() == [209]
         write_png(tmp_path / "test" / "p_000_alpha.png", np.full((HEIGHT, WIDTH), 207, np.uint8))
-
-
-def test_masks_in_a_folder_beside_that_of_the_photographs(tmp_path):
-    written = scene(2)
-    write_nerf(tmp_path, written)
-    (tmp_path / "test_mask").mkdir()
-    write_png(tmp_path / "test_mask" / "p_000.png", np.full((HEIGHT, WIDTH), 209, np.uint8))
-    assert load_photos(tmp_path, "test").alpha.unique().tolist() == [209]
-    assert np.array_equal(load_photos(tmp_path).alpha[0], written.pictures[1, ..., 3])
 
 
 @pytest.mark.parametrize("writer", [write_nerf, write_nerfstudio, write_colmap])
@@ -150,3 +144,48 @@ def test_splits(tmp_path, files, splits):
     for file in files:
         (tmp_path / file).write_text("{}")
     assert splits_of(tmp_path) == splits
+
+
+# Pixels of stored photographs in linear float, whatever they are stored as
+
+
+def photos(color, alpha):
+    views, height, width = alpha.shape
+    pose = torch.eye(4)[:3].expand(views, 3, 4)
+    cameras = Cameras(pose, torch.ones(views, 2), torch.ones(views, 2), width, height)
+    return Photos(Path("nowhere"), [f"r_{v}" for v in range(views)], color, alpha, cameras)
+
+
+@pytest.fixture
+def stored():
+    generator = torch.Generator().manual_seed(0)
+    return photos(
+        torch.randint(0, 256, (2, 3, 4, 3), dtype=torch.uint8, generator=generator),
+        torch.randint(0, 256, (2, 3, 4), dtype=torch.uint8, generator=generator),
+    )
+
+
+def test_bytes_are_srgb_and_coverage(stored):
+    color, alpha = stored.picture(1)
+    torch.testing.assert_close(color, srgb_to_linear(stored.color[1].float() / 255))
+    torch.testing.assert_close(alpha, stored.alpha[1].float() / 255)
+    assert len(stored) == 2
+    torch.testing.assert_close(stored.coverage()[1], alpha)
+
+
+def test_floats_are_linear_already(stored):
+    color, alpha = 7 * torch.rand(2, 3, 4, 3), torch.rand(2, 3, 4)  # radiance may exceed 1
+    linear = photos(color, alpha)
+    assert torch.equal(linear.picture(0)[0], color[0])
+    assert torch.equal(linear.picture(0)[1], alpha[0])
+    assert torch.equal(linear.coverage(), alpha)
+
+
+def test_single_pixels_are_those_of_the_picture(stored):
+    view, row, column = torch.tensor([0, 1, 1]), torch.tensor([2, 0, 2]), torch.tensor([3, 1, 0])
+    color, alpha = stored.pixels(view, row, column)
+    for i in range(3):
+        whole = stored.picture(int(view[i]))
+        # The power of the sRGB curve rounds as the length of the vector says.
+        torch.testing.assert_close(color[i], whole[0][row[i], column[i]])
+        assert torch.equal(alpha[i], whole[1][row[i], column[i]])

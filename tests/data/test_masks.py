@@ -1,22 +1,12 @@
 """Masks in files of their own: which is whose, what their numbers mean, how they lie on pixels."""
 
+import layouts
 import numpy as np
 import pytest
 import torch
 from analytic import write_scene
-from layouts import (
-    save_turned,
-    scene,
-    write_colmap,
-    write_idr,
-    write_llff,
-    write_metashape,
-    write_neilf,
-    write_nerfstudio,
-    write_polycam,
-    write_realitycapture,
-)
-from PIL import Image
+from layouts import save_turned, scene, write_colmap, write_llff, write_nerfstudio
+from PIL import Image, ImageOps
 
 from univoxel.data import load_photos
 from univoxel.data.images import (
@@ -65,6 +55,25 @@ def test_folders_tell_apart_what_names_do_not(tmp_path, folder):
         masks_in(folder, [("1", tmp_path / "1.jpg")])
 
 
+def test_folders_of_masks_that_do_not_fit(tmp_path, folder):
+    """A mask of two photographs; those of a split, where that of the photograph is missing."""
+    asked = [("a", tmp_path / "a.jpg")]
+    with pytest.raises(DataError, match="masks: expected a folder of masks, got nothing there"):
+        masks_in(folder, asked)
+    folder.mkdir()
+    with pytest.raises(DataError, match=r"expected masks .*, found no image"):
+        masks_in(folder, asked)
+    save(folder / "1.png", np.zeros((2, 2)))
+    asked = [(f"{side}/1", tmp_path / side / "1.jpg") for side in ("left", "right")]
+    with pytest.raises(DataError, match=r"masks/1\.png: expected a mask of one photograph, but"):
+        masks_in(folder, asked)
+    for name in ("train/1", "train/2", "test/3"):
+        save(tmp_path / "splits" / f"{name}.png", np.zeros((2, 2)))
+    asked = [(name, tmp_path / "train" / f"{name}.jpg") for name in "123"]
+    with pytest.raises(DataError, match=r"none for 1: 3\.jpg"):
+        masks_in(tmp_path / "splits", asked)
+
+
 def test_a_mask_is_of_the_photograph_that_it_names_most_exactly(tmp_path, folder):
     names = {"a.jpg": "a.jpg.png", "a.png": "a.png.png", "mask_1.jpg": "mask_1.png"}
     names |= {"1.jpg": "1_mask.png", "e\u0301.jpg": "\u00e9.png"}  # letters as Macs write them
@@ -73,22 +82,6 @@ def test_a_mask_is_of_the_photograph_that_it_names_most_exactly(tmp_path, folder
     assert masks_in(folder, asked) == list(paths.values())
     save(folder / "a.png", np.zeros((2, 2)))  # a copy: COLMAP's name is the exact one
     assert masks_in(folder, asked) == list(paths.values())
-
-
-def test_a_mask_of_two_photographs(tmp_path, folder):
-    save(folder / "1.png", np.zeros((2, 2)))
-    asked = [(f"{side}/1", tmp_path / side / "1.jpg") for side in ("left", "right")]
-    with pytest.raises(DataError, match=r"masks/1\.png: expected a mask of one photograph, but"):
-        masks_in(folder, asked)
-
-
-def test_masks_of_another_folder_are_of_no_photograph(tmp_path, folder):
-    """Of a split, where that of the photograph is missing."""
-    for name in ("train/1", "train/2", "test/3"):
-        save(folder / f"{name}.png", np.zeros((2, 2)))
-    asked = [(name, tmp_path / "train" / f"{name}.jpg") for name in "123"]
-    with pytest.raises(DataError, match=r"none for 1: 3\.jpg"):
-        masks_in(folder, asked)
 
 
 def test_where_folders_of_masks_are(tmp_path):
@@ -117,15 +110,13 @@ def test_beside_a_photograph_names_must_say_that_they_are_masks(tmp_path):
         masks_beside([("1", image)])
 
 
-WRITERS = [write_colmap, write_idr, write_llff, write_metashape, write_neilf, write_polycam]
-WRITERS += [write_realitycapture]
-
-
-@pytest.mark.parametrize("writer", WRITERS)
+@pytest.mark.parametrize(
+    "layout", ["colmap", "idr", "llff", "metashape", "neilf", "polycam", "realitycapture"]
+)
 @pytest.mark.parametrize("name", ["{}_mask.PNG", "MASK-{}.png", "{}.mask.png"])
-def test_names_of_masks_in_every_layout(tmp_path, writer, name):
+def test_names_of_masks_in_every_layout(tmp_path, layout, name):
     written = scene()
-    data = writer(tmp_path, written)
+    data = getattr(layouts, f"write_{layout}")(tmp_path, written)
     place = next(p for p in data.rglob("mask*") if p.is_dir())
     images = sorted(p for p in data.rglob("*.png") if place not in p.parents)
     for image, mask in zip(images, sorted(place.iterdir()), strict=True):
@@ -139,25 +130,12 @@ def test_names_of_masks_in_every_layout(tmp_path, writer, name):
     with pytest.raises(DataError, match=message) as caught:
         load_photos(data)
     assert not isinstance(caught.value, WithoutMasks)
-
-
-def test_masks_that_lie_beside_photographs_are_no_photographs(tmp_path):
-    written = scene()
-    data = write_llff(tmp_path, written)
+    data = write_llff(tmp_path / "beside", written)  # where they are no photographs
     for mask in (data / "masks").iterdir():
         save(data / "images" / f"._{mask.name}", np.zeros((2, 2)))
         mask.rename(data / "images" / f"{mask.stem}_mask.png")
     found = load_photos(data).alpha
     assert np.array_equal(found, written.pictures[written.split("train"), ..., 3])
-
-
-def test_folders_that_are_none(tmp_path, folder):
-    asked = [("a", tmp_path / "a.jpg")]
-    with pytest.raises(DataError, match="masks: expected a folder of masks, got nothing there"):
-        masks_in(folder, asked)
-    folder.mkdir()
-    with pytest.raises(DataError, match=r"expected masks .*, found no image"):
-        masks_in(folder, asked)
 
 
 def test_masks_of_another_size(folder):
@@ -175,10 +153,21 @@ def test_masks_of_another_size(folder):
         read_mask(path, 40, 60)
 
 
-def test_alpha_is_the_mask_where_there_is_one(folder):
+def test_what_masks_hold_is_as_it_is(tmp_path):
+    """Alpha where there is one, numbers in floating point, and soft masks: also where nothing of
+    them is certain, and those of one value; a cut-out that fills its picture is the object."""
     rgba = np.zeros((2, 2, 4))
     rgba[0, :, 3], rgba[1, :, :3] = 255, 255
-    assert read_mask(save(folder / "a.png", rgba), 2, 2).tolist() == [[255, 255], [0, 0]]
+    path = save(tmp_path / "a.png", rgba)
+    assert read_mask(path, 2, 2).tolist() == [[255, 255], [0, 0]]
+    for values in ([0, 100, 255], [0, 17, 180], [90, 90, 90], [0, 0, 0]):
+        assert coverage_in(save(path, [values]))[0].tolist() == values
+    noise = np.random.default_rng(0).integers(0, 255, (9, 9, 4), np.uint8)
+    noise[..., 3] = 255
+    assert (coverage_in(save(path, noise)) == 255).all()
+    for high in (255, 1):
+        write_exr(tmp_path / "a.exr", {"Y": high * np.array([[-0.1, 0.4, 1]])}, half=False)
+        assert coverage_in(tmp_path / "a.exr")[0].tolist() == pytest.approx([0, 0.4, 1])
 
 
 HALF = np.array([[0, 0], [1, 1]])
@@ -260,17 +249,8 @@ def test_what_is_the_object(tmp_path, what):
     assert float(found.max()) == (1 if "16" in what else 255)
 
 
-@pytest.mark.parametrize(("high", "found"), [(255, [0, 0.4, 1]), (1, [0, 0.4, 1])])
-def test_masks_in_floating_point(tmp_path, high, found):
-    write_exr(tmp_path / "a.exr", {"Y": high * np.array([[-0.1, 0.4, 1]])}, half=False)
-    assert coverage_in(tmp_path / "a.exr")[0].tolist() == pytest.approx(found)
-
-
-def test_soft_masks_stay_as_they_are(tmp_path):
-    """Also where nothing of them is certain, and those of one value."""
-    for values in ([0, 100, 255], [0, 17, 180], [90, 90, 90], [0, 0, 0]):
-        save(tmp_path / "a.png", [values])
-        assert coverage_in(tmp_path / "a.png")[0].tolist() == values
+COLORFUL = np.random.default_rng(0).integers(0, 255, (9, 9, 3), np.uint8)
+TWO_COLORS = np.array([[[255] * 3, [255, 0, 0]]], np.uint8)
 
 
 @pytest.mark.parametrize(
@@ -279,27 +259,14 @@ def test_soft_masks_stay_as_they_are(tmp_path):
         (Image.fromarray(np.array([[0, 1, 2]], np.uint8)), "values of at most 2 of 255"),
         (palette([[0, 1, 2]], (0, 0, 0), (128, 0, 0), (0, 128, 0)), "3 palette colours"),
         (palette([[0, 1, 1]], (9, 9, 200), (128, 0, 0)), "2 palette colours"),
-        (
-            Image.fromarray(np.random.default_rng(0).integers(0, 255, (9, 9, 3), np.uint8)),
-            "got an image with several colours",
-        ),
-        (
-            Image.fromarray(np.array([[[255] * 3, [255, 0, 0]]], np.uint8)),
-            "got an image with several colours",
-        ),
+        (Image.fromarray(COLORFUL), "got an image with several colours"),
+        (Image.fromarray(TWO_COLORS), "got an image with several colours"),
     ],
 )
 def test_pictures_that_say_nothing_of_one_object(tmp_path, picture, message):
     picture.save(tmp_path / "a.png")
     with pytest.raises(DataError, match=rf"a\.png: expected a mask.*{message}.*: use masks that"):
         coverage_in(tmp_path / "a.png")
-
-
-def test_a_cut_out_that_fills_its_picture_is_the_object(tmp_path):
-    noise = np.random.default_rng(0).integers(0, 255, (9, 9, 4), np.uint8)
-    noise[..., 3] = 255
-    write_png(tmp_path / "a.png", noise)
-    assert (coverage_in(tmp_path / "a.png") == 255).all()
 
 
 def test_inverted_masks_are_refused(tmp_path):
@@ -350,11 +317,16 @@ def test_masks_of_pictures_that_were_mirrored_or_turned(lit, way, word):
         load_photos(lit)
 
 
-def test_some_masks_may_be_mirrored(lit):
+def test_some_masks_may_be_mirrored_but_not_all_faint(lit):
     """A vote would mend them: one that fits by chance is no reason to end."""
-    for path in sorted((lit / "masks").iterdir())[:5]:
+    paths = sorted((lit / "masks").iterdir())
+    for path in paths[:5]:
         save(path, np.fliplr(np.asarray(Image.open(path))))
     assert load_photos(lit).alpha.any()
+    for path in paths:
+        save(path, np.asarray(Image.open(path)) // 4 + np.arange(40) % 20)
+    with pytest.raises(DataError, match=r"expected masks .*, got values of at most 82 of 255 in 8"):
+        load_photos(lit)
 
 
 @pytest.mark.parametrize("straight", [True, False])
@@ -372,14 +344,6 @@ def test_colours_that_are_multiplied_by_alpha_are_told(lit, caplog, straight):
     assert ("colours seem to be premultiplied by alpha" in caplog.text) != straight
 
 
-def test_faint_masks_are_refused(lit):
-    for path in (lit / "masks").iterdir():
-        mask = np.asarray(Image.open(path)) // 4
-        save(path, mask + np.arange(40) % 20)
-    with pytest.raises(DataError, match=r"expected masks .*, got values of at most 82 of 255 in 8"):
-        load_photos(lit)
-
-
 # Photographs that EXIF says to turn
 
 
@@ -390,24 +354,15 @@ def turned_photograph(path, upright, tag):
 
 
 @pytest.mark.parametrize("tag", range(1, 9))
-def test_turning_is_that_of_viewers(tmp_path, tag):
-    from PIL import ImageOps
-
-    upright = np.random.default_rng(0).integers(0, 255, (16, 24, 3), np.uint8)
-    turned_photograph(tmp_path / "a.jpg", upright, tag)
-    with Image.open(tmp_path / "a.jpg") as image:
-        stored = torch.from_numpy(np.array(image))
-        looked_at = np.array(ImageOps.exif_transpose(image))
-    assert orientation(tmp_path / "a.jpg") == tag
-    assert np.array_equal(upright_from_stored(stored, tag), looked_at)
-
-
-@pytest.mark.parametrize("tag", range(1, 9))
 def test_masks_follow_their_photographs(tmp_path, tag):
     """Upright ones are turned to the stored pixels, by their size, or where they say so."""
     upright = np.zeros((16, 24), np.uint8)
     upright[2:7, 3:9] = 255
     turned_photograph(tmp_path / "a.jpg", np.repeat(upright[..., None], 3, 2), tag)
+    with Image.open(tmp_path / "a.jpg") as image:  # turning is that of viewers
+        as_stored, looked_at = np.array(image), np.array(ImageOps.exif_transpose(image))
+    assert orientation(tmp_path / "a.jpg") == tag
+    assert np.array_equal(upright_from_stored(torch.from_numpy(as_stored), tag), looked_at)
     stored = stored_from_upright(torch.from_numpy(upright), tag).contiguous()
     height, width = stored.shape
     plain, tagged, other = (tmp_path / name for name in ("a.png", "b.jpg", "c.jpg"))

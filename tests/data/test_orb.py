@@ -105,26 +105,17 @@ def test_truth(tmp_path):
     assert load_truth(load_photos(folder, "test", downscale=2), 1).depth.max() == 3.5
 
 
+NORMAL, DEPTH = "surface_normal/0000.npy", "z_depth/0000.npy"
+
+
 @pytest.mark.parametrize(
     ("place", "array", "message"),
     [
-        ("z_depth/0000.npy", np.ones((2, 2)), r"0000.npy: expected 12x8 pixels .*, got 2x2"),
-        (
-            "z_depth/0000.npy",
-            np.ones((8, 12, 1)),
-            r"expected finite values \[H, W\], got \[8, 12, 1\]",
-        ),
-        (
-            "z_depth/0000.npy",
-            np.full((8, 12), np.nan),
-            r"finite values \[H, W\], got \[8, 12\] of float",
-        ),
-        ("surface_normal/0000.npy", np.ones((8, 12)), r"finite values \[H, W, 3\], got \[8, 12\]"),
-        (
-            "surface_normal/0000.npy",
-            np.ones((8, 12, 3), int),
-            r"finite values \[H, W, 3\], .* of int64",
-        ),
+        (DEPTH, np.ones((2, 2)), r"0000.npy: expected 12x8 pixels .*, got 2x2"),
+        (DEPTH, np.ones((8, 12, 1)), r"expected finite values \[H, W\], got \[8, 12, 1\]"),
+        (DEPTH, np.full((8, 12), np.nan), r"finite values \[H, W\], got \[8, 12\] of float"),
+        (NORMAL, np.ones((8, 12)), r"finite values \[H, W, 3\], got \[8, 12\]"),
+        (NORMAL, np.ones((8, 12, 3), int), r"finite values \[H, W, 3\], .* of int64"),
     ],
 )
 def test_one_line_for_what_is_broken(tmp_path, place, array, message):

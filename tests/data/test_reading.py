@@ -6,7 +6,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
-from layouts import HEIGHT, WIDTH, replaced, scene, write_nerf, write_nerfstudio
+from layouts import HEIGHT, WIDTH, repainted, replaced, scene, write_nerf, write_nerfstudio
 from PIL import Image
 from safetensors import safe_open
 
@@ -72,12 +72,8 @@ def test_only_what_a_mask_shows_is_decoded(monkeypatch, window, factor, bent):
     assert 0 < (wanted[1] > 0).float().mean() < 0.6
     assert torch.equal(found[0], wanted[0])
     assert torch.equal(found[1], wanted[1])
-
-
-def test_where_a_mask_shows_nothing_the_middle_of_a_square_stays():
-    color = torch.randint(1, 256, (31, 40, 3), dtype=torch.uint8)
-    found = load_images.resampled(color, torch.zeros(31, 40, dtype=torch.uint8), 3)
-    assert torch.equal(found[0], color[1:30:3, 1:39:3])
+    found = load_images.resampled(color, torch.zeros_like(alpha), 3)
+    assert torch.equal(found[0], color[1:30:3, 1:39:3])  # the middle of a square stays
     assert not found[1].any()
 
 
@@ -141,20 +137,19 @@ def test_what_was_kept_is_what_was_read(data, tmp_path, read):
     assert file.stat().st_mtime_ns == stamp  # not written again
     load_photos(data, downscale=2)
     assert len(read) == 2 * 17  # only where it was said
+    plain = load_kept(write_nerf(tmp_path / "plain", scene()), tmp_path / "none")
+    assert plain.origin == ""
+    assert not (tmp_path / "none").exists()  # as they are they are there already
 
 
-def touched(data):
-    os.utime(data / "images" / "p_001.png", ns=(1, 1))
-
-
-def other_mask(data):
-    write_png(data / "masks" / "p_001.png", np.full((29, 37), 255, np.uint8))
-
-
-another_lens = replaced("transforms.json", ('"p2": 0.01', '"p2": 0.02'))
-
-
-@pytest.mark.parametrize("change", [touched, other_mask, another_lens])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda data: os.utime(data / "images" / "p_001.png", ns=(1, 1)),
+        repainted("masks/p_001.png", np.full((29, 37), 255, np.uint8)),
+        replaced("transforms.json", ('"p2": 0.01', '"p2": 0.02')),
+    ],
+)
 def test_what_is_no_longer_so_is_read_again(data, tmp_path, read, change):
     file = tmp_path / "kept"
     load_kept(data, file, downscale=2)
@@ -187,29 +182,19 @@ def test_masks_beside_photographs_count(tmp_path, read):
     assert load_kept(folder, file, downscale=2).alpha[0].unique().tolist() == [9]
 
 
-def cut_off(file):
-    file.write_bytes(file.read_bytes()[:-7])
-
-
-def no_such_file(file):
-    file.write_bytes(b"something else")
-
-
-def empty(file):
-    file.write_bytes(b"")
-
-
-def a_bit(file):
-    content = bytearray(file.read_bytes())
-    content[-9] ^= 4
-    file.write_bytes(content)
-
-
-@pytest.mark.parametrize("harm", [cut_off, no_such_file, empty, a_bit])
+@pytest.mark.parametrize(
+    "harm",
+    [
+        lambda content: content[:-7],
+        lambda content: b"something else",
+        lambda content: b"",
+        lambda content: content[:-9] + bytes([content[-9] ^ 4]) + content[-8:],
+    ],
+)
 def test_broken_files_are_passed_over_and_written_anew(data, tmp_path, read, harm):
     file = tmp_path / "kept"
     wanted = load_kept(data, file, downscale=2)
-    harm(file)
+    file.write_bytes(harm(file.read_bytes()))
     assert same(load_kept(data, file, downscale=2), wanted)
     assert len(read) == 2 * 17
     assert same(load_kept(data, file, downscale=2), wanted)
@@ -225,13 +210,6 @@ def test_what_cannot_be_written_is_said_and_does_no_harm(data, tmp_path, caplog)
     keep_photos(photos, tmp_path / "kept")
     assert same(load_photos(data, downscale=2, kept=tmp_path / "kept"), photos)
     assert [p.name for p in tmp_path.iterdir() if p.name.endswith(".tmp")] == []
-
-
-def test_photographs_as_they_are_are_not_kept(tmp_path):
-    """They are there already."""
-    photos = load_kept(write_nerf(tmp_path / "data", scene()), tmp_path / "kept")
-    assert photos.origin == ""
-    assert not (tmp_path / "kept").exists()
 
 
 def test_pictures_of_differing_sizes_and_linear_ones_are_kept(tmp_path, read):

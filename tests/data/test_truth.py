@@ -56,12 +56,25 @@ def test_truth(tmp_path):
     assert float(truth.depth[1, 1]) == 4
     assert truth.mask.sum() == HEIGHT * WIDTH - 1
     assert not truth.mask[0, 0]
-
-
-def test_truth_that_is_not_there(tmp_path):
-    assert all(value is None for value in vars(load_truth(photos(tmp_path), 0)).values())
     save_truth(tmp_path, albedo=None)
     assert load_truth(photos(tmp_path), 0).albedo is None
+    assert all(v is None for v in vars(load_truth(photos(tmp_path, "r_1"), 0)).values())
+
+
+def test_points(tmp_path):
+    assert load_points(tmp_path) is None
+    for arrays, message in (
+        ({"vertices": np.eye(3)}, r"expected an array points of shape .*, got vertices \[3, 3\]"),
+        ({"points": np.zeros((2, 2))}, r"got points \[2, 2\]"),
+        ({"points": np.zeros((0, 3))}, r"got points \[0, 3\]"),
+        ({"points": np.full((2, 3), np.inf)}, "expected finite points"),
+        ({}, "got no arrays"),
+    ):
+        np.savez(tmp_path / "points.npz", **arrays)
+        with pytest.raises(DataError, match=rf"points\.npz: .*{message}"):
+            load_points(tmp_path)
+    np.savez(tmp_path / "points.npz", points=np.eye(3))
+    assert torch.equal(load_points(tmp_path), torch.eye(3))
 
 
 @pytest.mark.parametrize(
@@ -110,31 +123,6 @@ def test_broken_relit_views(tmp_path):
         load_relit(photos(tmp_path, "r_0", "r_1"), "city")
 
 
-def test_points(tmp_path):
-    assert load_points(tmp_path) is None
-    np.savez(tmp_path / "points.npz", points=np.eye(3))
-    assert torch.equal(load_points(tmp_path), torch.eye(3))
-
-
-@pytest.mark.parametrize(
-    ("arrays", "message"),
-    [
-        (
-            {"vertices": np.eye(3)},
-            r"expected an array points of shape \[P, 3\], got vertices \[3, 3\]",
-        ),
-        ({"points": np.zeros((2, 2))}, r"got points \[2, 2\]"),
-        ({"points": np.zeros((0, 3))}, r"got points \[0, 3\]"),
-        ({"points": np.full((2, 3), np.inf)}, "expected finite points"),
-        ({}, "got no arrays"),
-    ],
-)
-def test_broken_points(tmp_path, arrays, message):
-    np.savez(tmp_path / "points.npz", **arrays)
-    with pytest.raises(DataError, match=rf"points\.npz: .*{message}"):
-        load_points(tmp_path)
-
-
 # Truth as the data sets of the field have it
 
 
@@ -163,7 +151,8 @@ def test_synthetic4relight_truth(tmp_path, channels):
     assert truth.depth is None
 
 
-def test_tensoir_truth_is_linear(tmp_path):
+def test_truth_of_tensoir_and_shiny_blender(tmp_path):
+    """Albedo is linear; pictures have to fit."""
     (tmp_path / "test_000").mkdir()
     write_png(tmp_path / "test_000" / "albedo.png", gray(102))
     write_png(tmp_path / "test_000" / "normal.png", encoded_normal([0.6, 0.0, 0.8]))
@@ -173,23 +162,26 @@ def test_tensoir_truth_is_linear(tmp_path):
     torch.testing.assert_close(truth.normal[2, 3], torch.tensor([0.6, 0.0, 0.8]), atol=6e-3, rtol=0)
     torch.testing.assert_close(truth.normal.norm(dim=-1), torch.ones(HEIGHT, WIDTH))
     assert truth.roughness is None
+    (tmp_path / "test").mkdir()
+    write_png(tmp_path / "test" / "r_0_normal.png", encoded_normal([0.0, -1.0, 0.0]))
+    truth = load_truth(photos(tmp_path), 0)
+    wanted = torch.tensor([0.0, -1.0, 0.0])
+    torch.testing.assert_close(truth.normal[0, 0], wanted, atol=6e-3, rtol=0)
+    assert bool(truth.mask.all())
+    assert truth.albedo is None
+    for file, picture, message in (
+        ("normal", gray(1)[..., 0], "expected an image with 3 or 4 channels, got 1"),
+        ("albedo", gray(1, width=5), "expected 6x4 pixels as in the photograph, got 5x4"),
+    ):
+        write_png(tmp_path / "test" / f"r_0_{file}.png", picture)
+        with pytest.raises(DataError, match=rf"r_0_{file}\.png: {message}"):
+            load_truth(photos(tmp_path), 0)
 
 
 def encoded_normal(normal):
     return np.broadcast_to(
         (255 * (np.array(normal) / 2 + 0.5)).round().astype(np.uint8), (HEIGHT, WIDTH, 3)
     )
-
-
-def test_shiny_blender_truth(tmp_path):
-    (tmp_path / "test").mkdir()
-    write_png(tmp_path / "test" / "r_0_normal.png", encoded_normal([0.0, -1.0, 0.0]))
-    truth = load_truth(photos(tmp_path), 0)
-    torch.testing.assert_close(
-        truth.normal[0, 0], torch.tensor([0.0, -1.0, 0.0]), atol=6e-3, rtol=0
-    )
-    assert bool(truth.mask.all())
-    assert truth.albedo is None
 
 
 def test_truth_is_shrunk_by_coverage(tmp_path):
@@ -207,20 +199,6 @@ def test_truth_is_shrunk_by_coverage(tmp_path):
     assert float(truth.roughness[0, 0]) == pytest.approx(0.25)  # its transparent pixel says nothing
     assert float(truth.roughness[1, 1]) == pytest.approx(0.3)
     torch.testing.assert_close(truth.normal[1, 1], torch.tensor([0.5, 0.0, 0.5]) * 2**0.5)
-
-
-@pytest.mark.parametrize(
-    ("file", "picture", "message"),
-    [
-        ("albedo", gray(1, width=5), "expected 6x4 pixels as in the photograph, got 5x4"),
-        ("normal", gray(1)[..., 0], "expected an image with 3 or 4 channels, got 1"),
-    ],
-)
-def test_broken_pictures_of_truth(tmp_path, file, picture, message):
-    (tmp_path / "test").mkdir()
-    write_png(tmp_path / "test" / f"r_0_{file}.png", picture)
-    with pytest.raises(DataError, match=rf"r_0_{file}\.png: {message}"):
-        load_truth(photos(tmp_path), 0)
 
 
 def test_maps_of_synthetic4relight(tmp_path):

@@ -7,7 +7,6 @@ import sys
 
 import pytest
 import torch
-from asymmetric_scene import lopsided
 
 from univoxel.core.records import Mesh
 from univoxel.ops.charts import corner_weights, rasterise, unwrap
@@ -19,11 +18,11 @@ CORNERS = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 
 
 @pytest.fixture(scope="module")
-def mesh():
-    return simplify(clean(Mesh(*lopsided().field.isosurface())), 1000)
+def mesh(balls):
+    return simplify(clean(Mesh(*balls.field.isosurface())), 1000)
 
 
-def test_charts_keep_the_triangles_and_do_not_overlap(mesh):
+def test_charts_keep_the_triangles_and_do_not_overlap(mesh, monkeypatch):
     size = 256
     source, faces, uv = unwrap(mesh, size)
     assert torch.equal(source[faces.long()], mesh.faces.long())
@@ -36,6 +35,10 @@ def test_charts_keep_the_triangles_and_do_not_overlap(mesh):
     # one per cent for borders.
     assert len(texel) == pytest.approx(float(area.sum()) * size * size, rel=0.01)
     assert area.sum() > 0.4  # padding takes much of so small a texture
+    with pytest.raises(ValueError, match="charts: Index out of range"):
+        unwrap(Mesh(torch.eye(3), torch.tensor([[0, 1, 3]])), 64)
+    monkeypatch.setattr("univoxel.ops.charts.REGION", 50)  # beyond which no chart goes
+    assert len(unwrap(mesh, size)[0]) > 1.1 * len(source)  # more seams
 
 
 def test_charts_are_those_that_the_package_xatlas_makes():
@@ -52,17 +55,6 @@ def test_charts_are_those_that_the_package_xatlas_makes():
     assert len(source) == 700
     corners = [[0.7366594, 0.3600158], [0.0017031, 0.6864952], [0.1306851, 0.6725426]]
     torch.testing.assert_close(uv[[0, 300, -1]], torch.tensor(corners), rtol=0, atol=1e-5)
-
-
-def test_no_chart_goes_beyond_a_region(mesh, monkeypatch):
-    whole = len(unwrap(mesh, 256)[0])
-    monkeypatch.setattr("univoxel.ops.charts.REGION", 50)
-    assert len(unwrap(mesh, 256)[0]) > 1.1 * whole  # more seams
-
-
-def test_charts_of_a_face_without_its_vertex_are_refused():
-    with pytest.raises(ValueError, match="charts: Index out of range"):
-        unwrap(Mesh(torch.eye(3), torch.tensor([[0, 1, 3]])), 64)
 
 
 # Many short searches; each begins threads and waits for them to end
@@ -112,6 +104,13 @@ def test_tangents_of_a_turned_square(mirrored):
     # +y of the frame is +v in either case
     b = tangents[:, 3:] * torch.linalg.cross(n.expand(4, 3), tangents[:, :3])
     torch.testing.assert_close(b, v.expand(4, 3))
+    # A face without texture still has a frame
+    normal = torch.tensor([0.0, 0, 1]).expand(4, 3)
+    corners = torch.cat([CORNERS, torch.zeros(4, 1)], 1)
+    tangents = vertex_tangents(corners, SQUARE, normal, torch.full((4, 2), 0.5))
+    torch.testing.assert_close(tangents[:, :3].norm(dim=1), torch.ones(4))
+    assert (tangents[:, 2] == 0).all()
+    assert (tangents[:, 3] == 1).all()
 
 
 def test_tangents_are_a_frame_on_a_curved_mesh(mesh):
@@ -129,15 +128,6 @@ def test_tangents_are_a_frame_on_a_curved_mesh(mesh):
     assert (cosine.sign() == du[:, 0].sign())[steep].float().mean() > 0.99
 
 
-def test_a_face_without_texture_still_has_a_frame():
-    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    normal = torch.tensor([0.0, 0, 1]).expand(4, 3)
-    tangents = vertex_tangents(vertices, SQUARE, normal, torch.full((4, 2), 0.5))
-    torch.testing.assert_close(tangents[:, :3].norm(dim=1), torch.ones(4))
-    assert (tangents[:, 2] == 0).all()
-    assert (tangents[:, 3] == 1).all()
-
-
 def test_texels_of_a_square(monkeypatch):
     monkeypatch.setattr("univoxel.ops.charts.AT_ONCE", 100)  # several chunks
     size = 16
@@ -153,14 +143,9 @@ def test_texels_of_a_square(monkeypatch):
     torch.testing.assert_close(point[:, 0], (column + 0.5) / size)
     torch.testing.assert_close(point[:, 1], 1 - (row + 0.5) / size)
     assert (weight >= -1e-6).all()
-
-
-def test_thin_and_outer_triangles_hold_no_texel():
-    uv = torch.tensor(
-        [[0.1, 0.1], [0.9, 0.1], [0.5, 0.1], [0.26, 0.26], [0.27, 0.26], [0.26, 0.27]]
-    )
-    faces = torch.tensor([[0, 1, 2], [3, 4, 5]], dtype=torch.int32)
-    assert len(rasterise(uv, faces, 4)[0]) == 0
+    # Thin triangles and those between the middles of texels hold none
+    thin = [[0.1, 0.1], [0.9, 0.1], [0.5, 0.1], [0.26, 0.26], [0.27, 0.26], [0.26, 0.27]]
+    assert len(rasterise(torch.tensor(thin), torch.arange(6).int().view(2, 3), 4)[0]) == 0
 
 
 def test_the_background_takes_the_nearest_texel():

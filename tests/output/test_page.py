@@ -7,15 +7,14 @@ import json
 import logging
 import math
 import re
-import warnings
 from pathlib import Path
 from unittest.mock import Mock
 
 import numpy as np
-import pygltflib
 import pytest
 import torch
 from asymmetric_scene import lopsided
+from glb import Glb
 from scipy.spatial import ConvexHull
 
 from univoxel.api import Run
@@ -56,17 +55,12 @@ def embedded(text, name):
     return re.search(rf'<script id="{name}" type="[^"]*">(.*?)</script>', text, re.DOTALL)[1]
 
 
-def model_of(text):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        return pygltflib.GLTF2.load_from_bytes(base64.b64decode(embedded(text, "model")))
-
-
 def test_the_page_is_whole(text):
     """It names nothing to load, and tells what the run tells."""
     assert "default-src 'none'" in text
     assert not re.search(r'(?:src|href)\s*=\s*"(?!data:)', text)
-    assert re.findall(r"url\((?!data:)", embedded_style(text)) == []
+    style = re.search(r"<style>(.*?)</style>", text, re.DOTALL)[1]
+    assert re.findall(r"url\((?!data:)", style) == []
     assert "&quot;Balls&quot; &lt;/script&gt; &amp; more</h1>" in text
     assert "trained in 32 s on the CPU \u00b7 validation 31.2 dB" in text
     assert "Nothing &lt;b&gt;is sure." in text
@@ -78,41 +72,44 @@ def test_the_page_is_whole(text):
     assert len(text) < 10e6
 
 
-def embedded_style(text):
-    return re.search(r"<style>(.*?)</style>", text, re.DOTALL)[1]
+USUAL = ["studio", "city", "sunset", "overcast"]
 
 
-def test_lights_of_the_page(text, scene):
+def test_lights_of_the_page(text, scene, tmp_path):
     described = json.loads(embedded(text, "scene"))
     names = [light["name"] for light in described["lights"]]
-    assert names == ["recovered", "studio", "city", "sunset", "overcast"]
+    assert names == ["recovered", *USUAL]
     assert described["view"] == list(page.START)  # there are no photographs
     first = described["lights"][0]
     half = np.frombuffer(base64.b64decode(first["texels"]), "<f2").reshape(first["height"], -1, 3)
     truth = scene.environment().latlong(first["height"]).detach().numpy()
     np.testing.assert_allclose(half, truth, rtol=1e-3, atol=1e-6)
-
-
-def test_a_run_without_a_map_has_the_others():
-    scene = lopsided(voxels=8**3)
-    scene.sky = None
-    lights = page.lights_of(scene, SMALL)
-    assert [light.name for light in lights] == ["studio", "city", "sunset", "overcast"]
+    written = page.as_json(page.Light("sun", torch.full((1, 2, 3), 1e6)))  # too bright for halves
+    assert np.isfinite(np.frombuffer(base64.b64decode(written["texels"]), "<f2")).all()
+    # Own maps take the place of usual ones; after <!--<script a browser does not see its end
+    paths = [tmp_path / "studio.exr", tmp_path / "<!--<script>.exr"]
+    for path in paths:
+        write_exr(path, {c: torch.ones(4, 8) for c in "RGB"})
+    options = page.PageOptions(**vars(SMALL) | {"envmaps": paths})
+    held = embedded(page.page_text(tmp_path, scene, options), "scene")
+    assert "<" not in held
+    names = [light["name"] for light in json.loads(held)["lights"]]
+    assert names == ["recovered", "studio", "<!--<script>", *USUAL[1:]]
+    without = lopsided(voxels=8**3)
+    without.sky = None
+    assert [light.name for light in page.lights_of(without, SMALL)] == USUAL
 
 
 def test_the_model_holds_what_light_reaches_it(text):
-    model = model_of(text)
-    assert {image.mimeType for image in model.images} == {"image/jpeg"}
-    attributes = vars(model.meshes[0].primitives[0].attributes)
-    extra = {name for name in attributes if name.startswith("_")}
+    model = Glb(base64.b64decode(embedded(text, "model")))
+    assert {kind for kind, _, _ in model.pictures()} == {"image/jpeg"}
+    extra = {name for name in vars(model.primitive.attributes) if name.startswith("_")}
     assert extra == {*(f"_DIRECT{i}" for i in range(7)), "_RED", "_GREEN", "_BLUE"}
-    stored = model.accessors[attributes["_DIRECT0"]]
-    assert (stored.componentType, stored.normalized) == (pygltflib.SHORT, True)
-    view = model.bufferViews[stored.bufferView]
-    blob = model.binary_blob()[view.byteOffset : view.byteOffset + view.byteLength]
-    numbers = np.frombuffer(blob, "<i2").reshape(-1, 4) / 32767
+    stored = model.accessor("_DIRECT0")
+    assert (stored.componentType, stored.normalized) == (5122, True)  # SHORT
+    numbers = model.values("_DIRECT0") / 32767
     open_sky = numbers[:, 0] / 0.282095
-    assert len(numbers) == model.accessors[attributes["POSITION"]].count
+    assert len(numbers) == model.accessor("POSITION").count
     assert open_sky.max() == pytest.approx(1, abs=0.01)  # the far side of the large ball
     assert 0.7 < open_sky.min() < 0.9  # where two balls meet
 
@@ -138,11 +135,6 @@ def mesh_of(vertices, faces, albedo):
     )
 
 
-def extracted(scene):
-    vertices, faces = scene.field.isosurface()
-    return vertices, faces.long()
-
-
 def hollowed(points, distance):
     """A bowl in the side of the large ball."""
     return torch.maximum(distance, 0.3 - (points - torch.tensor([-0.3, -0.1, 0])).norm(dim=-1))
@@ -151,8 +143,8 @@ def hollowed(points, distance):
 def test_transfer_is_the_light_that_a_path_tracer_finds():
     """Under light of degree 1 nothing is cut off: both see the same shadows and colours."""
     scene = lopsided(voxels=24**3, change=hollowed)
-    vertices, faces = extracted(scene)
-    albedo = (0.9, 0.5, 0.2)
+    vertices, faces = scene.field.isosurface()
+    faces, albedo = faces.long(), (0.9, 0.5, 0.2)
     mesh = mesh_of(vertices, faces, albedo)
     offset = 0.1 * scene.field.voxel_size
     direct, bounced = transfer(mesh, offset)
@@ -244,13 +236,10 @@ def test_made_maps_light_a_white_ball_as_paper():
         cosine = (fibonacci_sphere(200) @ direction.T).clamp_min(0)
         ball = cosine @ (area[:, None] * light.radiance.flatten(0, 1)) / math.pi
         assert 0.6 < ball.max() < 1.1, light.name
-
-
-def test_the_studio_key_stands_where_it_is_said():
     direction = latlong_directions(page.ROWS)
     brightest = page.studio().sum(2).flatten().argmax()
     phi = math.degrees(math.atan2(*direction.flatten(0, 1)[brightest, :2].flip(0).tolist()))
-    assert phi == pytest.approx(40, abs=20)
+    assert phi == pytest.approx(40, abs=20)  # where the studio's key is said to stand
 
 
 def test_a_large_map_is_averaged(tmp_path):
@@ -260,18 +249,6 @@ def test_a_large_map_is_averaged(tmp_path):
     assert light.name == "hall"
     expected = radiance.view(256, 2, 512, 2, 3).mean((1, 3))
     torch.testing.assert_close(light.radiance, expected)
-
-
-def test_a_map_too_bright_for_halves_is_clipped():
-    written = page.as_json(page.Light("sun", torch.full((1, 2, 3), 1e6)))
-    assert np.isfinite(np.frombuffer(base64.b64decode(written["texels"]), "<f2")).all()
-
-
-def test_own_maps_take_the_place_of_usual_ones(scene, tmp_path):
-    write_exr(tmp_path / "studio.exr", {c: torch.ones(4, 8) for c in "RGB"})
-    options = page.PageOptions(envmaps=[tmp_path / "studio.exr"])
-    names = [light.name for light in page.lights_of(scene, options)]
-    assert names == ["recovered", "studio", "city", "sunset", "overcast"]
 
 
 def test_mistakes_are_named(tmp_path):
@@ -299,44 +276,30 @@ def test_a_page_is_written_whole(scene, tmp_path, monkeypatch):
     text = target.read_text(encoding="utf-8")
     assert text.startswith("<!doctype html>")
     assert "trained in 61 s" in text  # the log ends before the training
+    for damaged in ("", "{", '{"seconds": 3}\n', "[1]\n", '{"seconds": "a", "held_out_psnr": 1}\n'):
+        (tmp_path / "log.jsonl").write_text(damaged)
+        assert page.facts_of(tmp_path) == []
 
 
-def test_training_ends_well_without_a_page(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(
-        "univoxel.output.page.write_page", Mock(side_effect=NoSurface("there is no surface"))
-    )
+def test_training_names_its_page_and_ends_well_without(tmp_path, monkeypatch, caplog):
+    write = Mock(side_effect=[tmp_path / "index.html", NoSurface("there is no surface")])
+    monkeypatch.setattr("univoxel.output.page.write_page", write)
     with caplog.at_level(logging.INFO, "univoxel"):
-        assert with_page(tmp_path) == tmp_path
-    assert caplog.messages == ["the web page was not written: there is no surface"]
-
-
-def test_training_names_its_page(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr("univoxel.output.page.write_page", lambda run, path: path)
-    with caplog.at_level(logging.INFO, "univoxel"):
-        with_page(tmp_path)
-    page, then = caplog.messages
-    assert page == f"Page: open {tmp_path / 'index.html'} in a browser"
+        assert with_page(tmp_path) == with_page(tmp_path) == tmp_path
+    named, then, without = caplog.messages
+    assert named == f"Page: open {tmp_path / 'index.html'} in a browser"
     assert then.startswith(f"Next: univoxel view {tmp_path}, or univoxel export {tmp_path} ")
+    assert without == "the web page was not written: there is no surface"
 
 
 def test_a_notebook_shows_the_page(scene, tmp_path, monkeypatch):
     monkeypatch.setattr("univoxel.api.load_scene", lambda run: scene)
     monkeypatch.setattr("univoxel.api.SMALL", SMALL)
     shown = Run(tmp_path)._repr_html_()
-    assert shown is not None
     inside = re.fullmatch(r'<iframe srcdoc="([^"]*)" style="[^"]*"></iframe>', shown)[1]
     assert html.unescape(inside).startswith("<!doctype html>")
-
-    monkeypatch.setattr(
-        "univoxel.api.page_text", Mock(side_effect=NoSurface("there is no surface"))
-    )
+    monkeypatch.setattr("univoxel.api.page_text", Mock(side_effect=NoSurface("none")))
     assert Run(tmp_path)._repr_html_() is None
-
-
-def test_a_damaged_log_tells_nothing(tmp_path):
-    for text in ("", "{", '{"seconds": 3}\n', "[1]\n", '{"seconds": "a", "held_out_psnr": "b"}\n'):
-        (tmp_path / "log.jsonl").write_text(text)
-        assert page.facts_of(tmp_path) == []
 
 
 def test_the_bundle_is_the_one_that_was_checked():
@@ -345,13 +308,3 @@ def test_the_bundle_is_the_one_that_was_checked():
     assert hashlib.sha256(bundle).hexdigest() == said[1]
     assert b"</script" not in bundle  # it stands in one
     assert (VENDOR / "LICENSE").read_text("utf-8").startswith("The MIT License")
-
-
-def test_names_of_maps_begin_no_comment(scene, tmp_path):
-    """After <!--<script a browser does not see where a script ends."""
-    path = tmp_path / "<!--<script>.exr"
-    write_exr(path, dict.fromkeys("RGB", np.ones((4, 8), np.float32)))
-    options = page.PageOptions(**vars(SMALL) | {"envmaps": (path,)})
-    held = embedded(page.page_text(tmp_path, scene, options), "scene")
-    assert "<" not in held
-    assert path.stem in [light["name"] for light in json.loads(held)["lights"]]

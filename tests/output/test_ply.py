@@ -1,10 +1,12 @@
-"""PLY files, read back by an independent reader."""
+"""PLY files: read back by an independent reader and by ours, and what is none."""
 
 import pytest
 import torch
 
 from univoxel.color import linear_to_srgb
 from univoxel.core.records import Mesh
+from univoxel.data.truth import read_ply
+from univoxel.errors import DataError
 from univoxel.output.mesh_files import write_ply
 
 trimesh = pytest.importorskip("trimesh")
@@ -18,9 +20,14 @@ MESH = Mesh(
 )
 
 
-def test_round_trip(tmp_path):
-    write_ply(tmp_path / "a.ply", MESH)
-    back = trimesh.load(tmp_path / "a.ply", process=False)
+def test_what_is_written_is_read(tmp_path):
+    path = tmp_path / "a.ply"
+    for mesh in (Mesh(MESH.vertices, MESH.faces), Mesh(MESH.vertices[:0], MESH.faces[:0]), MESH):
+        write_ply(path, mesh)
+        read = read_ply(path)
+        assert torch.equal(read.vertices, mesh.vertices)
+        assert torch.equal(read.faces, mesh.faces)
+    back = trimesh.load(path, process=False)
     assert torch.equal(torch.tensor(back.vertices).float(), MESH.vertices)
     assert torch.equal(torch.tensor(back.faces).int(), MESH.faces)
     torch.testing.assert_close(torch.tensor(back.vertex_normals).float(), MESH.normals)
@@ -32,13 +39,36 @@ def test_round_trip(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]
 
 
-def test_bare_and_empty_meshes(tmp_path):
-    write_ply(tmp_path / "bare.ply", Mesh(MESH.vertices, MESH.faces))
-    assert trimesh.load(tmp_path / "bare.ply", process=False).vertices.shape == (4, 3)
-    write_ply(tmp_path / "empty.ply", Mesh(torch.empty(0, 3), torch.empty(0, 3).int()))
-    assert b"element face 0\n" in (tmp_path / "empty.ply").read_bytes()
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda data: b"solid" + data, "expected a binary little-endian PLY file"),
+        (lambda data: data.replace(b"binary_little_endian", b"ascii"), "little-endian PLY file"),
+        (lambda data: data.replace(b"end_header", b"end"), "little-endian PLY file"),
+        (lambda data: data[:-5], "expected vertices x y z and triangles"),
+        (lambda data: data.replace(b"float z", b"float w"), "expected vertices x y z"),
+        (lambda data: data.replace(b"float z", b"half z"), "expected vertices x y z"),
+        (lambda data: data.replace(b"element face", b"element edge"), "expected vertices x y z"),
+        (lambda data: data.replace(b"vertex 4", b"vertex -1"), "could not read them: -1 of vertex"),
+        (lambda data: data.replace(b"face 2", b"face 9" + 30 * b"9"), "expected vertices x y z"),
+        (lambda data: data[:-12] + b"\x63" + data[-11:], "triangles with vertex indices below 4"),
+        (lambda data: data[:-13] + b"\4" + data[-12:], "triangles with vertex indices below 4"),
+    ],
+)
+def test_other_files_are_refused(tmp_path, change, message):
+    path = tmp_path / "a.ply"
+    write_ply(path, Mesh(MESH.vertices, MESH.faces[:2]))
+    path.write_bytes(change(path.read_bytes()))
+    with pytest.raises(DataError, match=f"a.ply: .*{message}"):
+        read_ply(path)
 
 
-def test_a_file_that_cannot_be_written(tmp_path):
+def test_what_cannot_be_read_or_written(tmp_path):
+    path = tmp_path / "a.ply"
+    with pytest.raises(DataError, match=r"a\.ply: cannot be read: No such file"):
+        read_ply(path)
+    write_ply(path, Mesh(MESH.vertices / torch.tensor([1.0, 0, 1]), MESH.faces))
+    with pytest.raises(DataError, match=r"a\.ply: expected finite vertices"):
+        read_ply(path)
     with pytest.raises(OSError, match=r"a\.ply"):
         write_ply(tmp_path / "missing" / "a.ply", MESH)

@@ -21,14 +21,14 @@ from univoxel.cli import main
 from univoxel.cli.trainer import train
 from univoxel.color import linear_to_srgb
 from univoxel.core.html import chart
-from univoxel.errors import DataError, MissingFile, NoSurface, UserError
+from univoxel.errors import DataError, NoSurface, UserError
 from univoxel.evaluation.confidence import azimuths
 from univoxel.lights import LocalSG, SGConfig
 from univoxel.output import report, report_pictures
 from univoxel.output.report import ReportOptions, report_text, what_is_known
 from univoxel.presets import preset
 from univoxel.render.pipeline import extract_mesh
-from univoxel.scene import load_checkpoint, save_scene
+from univoxel.scene import load_checkpoint
 from univoxel.sphere import latlong_directions
 
 SIZE, VIEWS, SECTOR = 24, 24, 90.0  # pixels, photographs, azimuth that none is taken from
@@ -93,6 +93,11 @@ def test_the_page_is_whole(text):
     assert len(text) < 2e6
     for _, picture in pictures(text):
         assert picture.std() > 1
+    errors, light = section(text, "Expected errors"), section(text, "Light")
+    assert "Mean expected error of the surface: 0." in errors
+    assert [name for name, _ in pictures(errors)] == ["front", "right", "back", "left"]
+    assert "no environment map: its light is local (sg)" in light
+    assert [name for name, _ in pictures(light)] == ["map", "diffuse sphere", "chrome sphere"]
 
 
 def test_it_asks_for_the_sector_that_was_not_photographed(run, text):
@@ -129,19 +134,6 @@ def test_photographs_stand_beside_their_render_the_worst_first(run, text):
     assert again.difference.max() == 0
 
 
-def test_expected_errors_are_painted_and_told(text):
-    said = section(text, "Expected errors")
-    assert "Mean expected error of the surface: 0." in said
-    names = [name for name, _ in pictures(said)]
-    assert names == ["front", "right", "back", "left"]
-
-
-def test_light_of_a_run_without_a_map(text):
-    said = section(text, "Light")
-    assert "no environment map: its light is local (sg)" in said
-    assert [name for name, _ in pictures(said)] == ["map", "diffuse sphere", "chrome sphere"]
-
-
 def test_the_map_of_lobes_that_are_everywhere_the_same_is_their_sum():
     scene = sphere_scene(0, light=SGConfig(lobes=3, hidden=4))
     assert isinstance(scene.light, LocalSG)
@@ -160,6 +152,13 @@ def test_the_map_of_lobes_that_are_everywhere_the_same_is_their_sum():
 
 def test_the_map_of_local_light_counts_points_where_they_face_it():
     """Red on the side of +X, blue on the other: so is what comes from there."""
+
+    class TwoSided(torch.nn.Module):
+        def incident(self, surface, wi):
+            side = (surface.position[:, :1] > 0).float()
+            color = side * torch.tensor([1.0, 0, 0]) + (1 - side) * torch.tensor([0, 0, 1.0])
+            return color[:, None].expand(-1, wi.shape[1], -1)
+
     scene = sphere_scene(0)
     scene.light = TwoSided()
     found = report_pictures.local_map(scene, extract_mesh(scene))
@@ -167,23 +166,11 @@ def test_the_map_of_local_light_counts_points_where_they_face_it():
     red = found[..., 0] / found.sum(-1)
     assert red[w > 0.9].min() > 0.8
     assert red[w < -0.9].max() < 0.2
-
-
-class TwoSided(torch.nn.Module):
-    def incident(self, surface, wi):
-        side = (surface.position[:, :1] > 0).float()
-        color = side * torch.tensor([1.0, 0, 0]) + (1 - side) * torch.tensor([0, 0, 1.0])
-        return color[:, None].expand(-1, wi.shape[1], -1)
-
-
-def test_a_recovered_map_is_shown_as_it_is():
+    # A recovered map is shown as it is; baked light is none
     scene = scene_of((0.5, 0.5, 0.5), 0.5, 32)
     found, about = report_pictures.found_light(scene, extract_mesh(scene))
     torch.testing.assert_close(found, scene.environment().latlong(report_pictures.ROWS))
     assert "recovered environment map" in about
-
-
-def test_baked_light_is_none():
     scene = sphere_scene(0, light=LIGHTS[-1])
     assert report_pictures.found_light(scene, extract_mesh(scene)) is None
 
@@ -319,20 +306,13 @@ def test_by_the_command_line(run, capfd, tmp_path):
         error = capfd.readouterr().err
         assert message in error
         assert error.count("\n") == 1
-
-
-def test_mistakes(tmp_path):
     with pytest.raises(UserError, match="size must be at least 16, got 8"):
         ReportOptions(size=8)
-    with pytest.raises(MissingFile, match="not a trained run"):
-        univoxel.open_run(tmp_path).report()
     empty = sphere_scene(0)
     with torch.no_grad():
         empty.field.sdf.fill_(1.0)
-    save_scene(empty, tmp_path, {})
-    scene, state = load_checkpoint(tmp_path)
     with pytest.raises(NoSurface):
-        report_text(tmp_path, scene, state)
+        report_text(tmp_path, empty, {})
 
 
 @pytest.mark.skipif(installed() is None, reason="needs a browser, such as Debian's chromium")

@@ -8,6 +8,7 @@ import pytest
 import torch
 from analytic import cameras_around
 from asymmetric_scene import lopsided
+from glb import Glb
 from torch.nn.functional import normalize
 
 from univoxel.cli.export import export
@@ -19,7 +20,7 @@ from univoxel.output.surface import cameras_of, seen_by, smoothed, surface_of
 from univoxel.output.topology import open_edges, simplify
 
 trimesh = pytest.importorskip("trimesh")
-pygltflib = pytest.importorskip("pygltflib")
+pytest.importorskip("pygltflib")
 
 
 def read(mesh):
@@ -88,12 +89,6 @@ def test_bricks_are_closed_as_the_dense_grid_is(axis, side):
     assert read(wanted).volume == pytest.approx(read(found).volume, abs=1e-3)
 
 
-def test_a_whole_surface_is_not_moved():
-    scene = lopsided()
-    for a, b in zip(scene.field.isosurface(), scene.field.isosurface(closed=True), strict=True):
-        assert torch.equal(a, b)
-
-
 @pytest.fixture(scope="module")
 def rough():
     """A ball that is rough all over, with waves some five voxels long: a third of a voxel high
@@ -110,6 +105,16 @@ def rough():
 @pytest.fixture(scope="module")
 def above():
     return cameras_above(cameras_around(24, 64, 2.5))
+
+
+def test_without_photographs_nothing_is_smoothed(balls, tmp_path, caplog):
+    """And a whole surface is not moved where it is closed."""
+    caplog.set_level(logging.INFO, logger="univoxel")
+    assert cameras_of(balls, tmp_path) is None
+    assert "mesh: not smoothed" in caplog.text
+    assert surface_of(balls, None).seen is None
+    for a, b in zip(balls.field.isosurface(), balls.field.isosurface(closed=True), strict=True):
+        assert torch.equal(a, b)
 
 
 def test_what_no_camera_sees_is_smooth_and_the_rest_is_as_it_was(rough, above):
@@ -180,14 +185,6 @@ def test_normals_and_relief_are_smooth_there_too(rough, above):
     assert share > without + 0.5 * (mesh.seen == 0).float().mean()
 
 
-def test_without_photographs_nothing_is_smoothed(tmp_path, caplog):
-    caplog.set_level(logging.INFO, logger="univoxel")
-    scene = lopsided(24**3)
-    assert cameras_of(scene, tmp_path) is None
-    assert "mesh: not smoothed" in caplog.text
-    assert surface_of(scene, None).seen is None
-
-
 def test_files_say_what_is_seen(rough, above, tmp_path, monkeypatch):
     monkeypatch.setattr("univoxel.scene.load_scene", lambda run: rough)
     monkeypatch.setattr("univoxel.output.surface.cameras_of", lambda scene, run: above)
@@ -196,18 +193,11 @@ def test_files_say_what_is_seen(rough, above, tmp_path, monkeypatch):
     cloud = trimesh.load(tmp_path / "a.ply", process=False)
     values = cloud.metadata["_ply_raw"]["vertex"]["data"]["seen"].ravel()
     check_seen(values, cloud.vertices[:, 2])
-    file = pygltflib.GLTF2().load(str(tmp_path / "a.glb"))
-    attributes = file.meshes[0].primitives[0].attributes
-    seen, place = (file.accessors[i] for i in (attributes._SEEN, attributes.POSITION))
-    assert (seen.type, seen.componentType) == ("SCALAR", pygltflib.FLOAT)
-    assert seen.count == place.count
-    values, positions = (
-        np.frombuffer(
-            file.binary_blob(), "<f4", n * a.count, file.bufferViews[a.bufferView].byteOffset
-        )
-        for n, a in ((1, seen), (3, place))
-    )
-    check_seen(values, positions.reshape(-1, 3)[:, 1])  # +Y is up in glTF
+    file = Glb(tmp_path / "a.glb")
+    assert file.accessor("_SEEN").type == "SCALAR"
+    values = file.values("_SEEN")
+    assert values.dtype == np.float32
+    check_seen(values[:, 0], file.values("POSITION")[:, 1])  # +Y is up in glTF
 
 
 def check_seen(values, height):

@@ -6,9 +6,9 @@ import types
 from dataclasses import replace
 from itertools import islice
 
-import asymmetric_scene
 import pytest
 import torch
+from asymmetric_scene import lamp as a_lamp
 from asymmetric_scene import layers_of, looking, subject_of, with_metal
 
 from univoxel.cli.relight import RelightOptions, relight_images
@@ -37,7 +37,7 @@ def subject(scene):
 
 @pytest.fixture(scope="module")
 def lamp():
-    return asymmetric_scene.lamp()
+    return a_lamp()
 
 
 @pytest.fixture
@@ -97,6 +97,7 @@ def test_layers_are_the_materials(scene, subject, lamp, camera):
         camera.camera_to_world[0, :, 2]
     )
     near, far = ends.min(), ends.max()
+    assert len(mesh_of(scene, 500).faces) <= 500
     expected = layers_of(surface) | {
         "depth": (1 - (depth - near) / (far - near))[:, None].expand(-1, 3),
     }
@@ -122,16 +123,8 @@ def test_expected_errors_are_those_at_the_vertices(scene, subject, lamp, camera)
     solid = (surface.opacity > 0.999).reshape(SIZE, SIZE)
     assert found[solid & (up > 0.05)][:, :3].mean() > 0.8
     assert found[solid & (up < -0.05)][:, :3].mean() < 0.1
-
-
-def test_expected_errors_need_photographs(subject, lamp, camera):
     with pytest.raises(UserError, match="photographs"):
-        quick_picture(subject, camera, Look(viewpoints.lighting(lamp), "expected error"))
-
-
-def test_a_mesh_may_be_coarser(scene):
-    assert len(mesh_of(scene, 500).faces) <= 500
-    assert mesh_of(scene, 500).albedo is not None
+        quick_picture(subject, camera, look)
 
 
 def test_a_caller_can_leave_between_steps(subject, lamp, camera):
@@ -188,8 +181,5 @@ def test_a_denoiser_goes_beside(monkeypatch, subject, lamp, camera):
     half = Look(viewpoints.lighting(lamp), exposure=-1.0)
     last = shown(refined_pictures(subject, camera, half, samples=20))[-1]
     torch.testing.assert_close(found[-1], last, rtol=0, atol=1e-5)
-
-
-def test_without_a_denoiser(monkeypatch):
     monkeypatch.setattr(frames, "find_spec", lambda name: None)
     assert not frames.available()

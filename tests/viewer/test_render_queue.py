@@ -1,5 +1,7 @@
-"""Who gets pictures, with viewers that are lists; and what the server refuses."""
+"""Who gets pictures, with viewers that are lists; films; and what the server refuses."""
 
+import io
+import math
 import os
 import signal
 import socket
@@ -7,28 +9,27 @@ import subprocess
 import sys
 import threading
 import time
+from itertools import pairwise
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
-from asymmetric_scene import lopsided, subject_of
+from PIL import Image
 
+from univoxel.camera import project
 from univoxel.data import Photos
 from univoxel.data.images import write_exr
 from univoxel.envmap import EnvMap
-from univoxel.errors import UserError
+from univoxel.errors import MissingExtra, UserError
 from univoxel.output.viewpoints import lighting, orbit
+from univoxel.viewer import render_queue as module
 from univoxel.viewer.frames import Look
-from univoxel.viewer.render_queue import Studio, Viewer
+from univoxel.viewer.render_queue import Studio, Viewer, film, kind, turned_about
 from univoxel.viewer.server import camera_of, laid_over, light_of_bytes, pose_for_viser, serving
 from univoxel.viewer.training import same_site
 
 PATIENCE = 120.0  # seconds, on a loaded machine
-
-
-@pytest.fixture(scope="module")
-def subject():
-    return subject_of(lopsided(24**3))
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +42,14 @@ def studio(subject):
     studio = Studio(subject)
     yield studio
     studio.stop()
+
+
+@pytest.fixture
+def watcher(studio):
+    """One who looks."""
+    watcher = Watcher()
+    studio.join(watcher.viewer)
+    return watcher
 
 
 class Watcher:
@@ -91,23 +100,30 @@ def test_one_leaves_in_the_middle_of_a_picture(studio, subject, light):
     assert len(leaves.sizes) == 1
 
 
-def test_a_mistake_is_one_line_and_others_go_on(studio, subject, light):
+def test_a_mistake_or_a_chore_that_fails_is_one_line(studio, watcher, subject, light, caplog):
     """Expected errors without photographs; then the same viewer asks for what there is."""
-    cameras, watcher = orbit(subject.traced.mesh, 1, 64), Watcher()
-    studio.join(watcher.viewer)
+    cameras = orbit(subject.traced.mesh, 1, 64)
+
+    def failing(error):
+        yield
+        raise error
+
     studio.ask(watcher.viewer, cameras, Look(light, "expected error"))
     watcher.wait(lambda: watcher.lines)
-    assert len(watcher.lines) == 1
+    studio.do(watcher.viewer, "a", failing(OSError("no room")))
+    watcher.wait(lambda: len(watcher.lines) == 2)
+    studio.do(watcher.viewer, "a", failing(KeyError("a fault")))
+    watcher.wait(lambda: len(watcher.lines) == 3)
     assert "photographs" in watcher.lines[0]
-    studio.ask(watcher.viewer, cameras, Look(light, "albedo"))
+    assert watcher.lines[1:] == ["no room", "rendering failed: see the terminal of univoxel"]
+    assert "a fault" in caplog.text
+    studio.ask(watcher.viewer, cameras, Look(light, "albedo"))  # the studio goes on
     watcher.wait(lambda: watcher.sizes)
 
 
-def test_chores_go_on_beside_pictures(studio, subject, light):
+def test_chores_go_on_beside_pictures(studio, watcher, subject, light):
     """Step by step; views that move go before; another of the same name takes its place."""
-    cameras, watcher = orbit(subject.traced.mesh, 1, 64), Watcher()
-    studio.join(watcher.viewer)
-    seen = []
+    cameras, seen = orbit(subject.traced.mesh, 1, 64), []
 
     def chore(name, steps):
         for step in range(steps):
@@ -136,27 +152,8 @@ def test_chores_go_on_beside_pictures(studio, subject, light):
     watcher.wait(lambda: "c" not in watcher.viewer.chores)
 
 
-def test_a_chore_that_fails_is_one_line(studio, subject, light, caplog):
-    cameras, watcher = orbit(subject.traced.mesh, 1, 64), Watcher()
-    studio.join(watcher.viewer)
-
-    def failing(error):
-        yield
-        raise error
-
-    studio.do(watcher.viewer, "a", failing(OSError("no room")))
-    watcher.wait(lambda: watcher.lines)
-    studio.do(watcher.viewer, "a", failing(KeyError("a fault")))
-    watcher.wait(lambda: len(watcher.lines) == 2)
-    assert watcher.lines == ["no room", "rendering failed: see the terminal of univoxel"]
-    assert "a fault" in caplog.text
-    studio.ask(watcher.viewer, cameras, Look(light, "albedo"))  # the studio goes on
-    watcher.wait(lambda: watcher.sizes)
-
-
-def test_chores_go_with_their_viewer(studio, subject, light):
-    watcher, ended = Watcher(), threading.Event()
-    studio.join(watcher.viewer)
+def test_chores_go_with_their_viewer(studio, watcher):
+    ended = threading.Event()
 
     def chore():
         try:
@@ -189,7 +186,7 @@ def test_it_listens_on_the_loopback_and_ends(subject, capsys):
     assert capsys.readouterr().out == ""
 
 
-def test_other_sites_are_refused():
+def test_a_socket_of_another_site_is_closed(subject):
     assert same_site("http://localhost:8080", "localhost:8080", "127.0.0.1")
     assert same_site("http://127.0.0.1:9000", "127.0.0.1:9000", "127.0.0.1")  # a forwarded port
     assert same_site(None, "localhost:8080", "127.0.0.1")  # no browser
@@ -197,9 +194,6 @@ def test_other_sites_are_refused():
     assert not same_site("http://example.org:8080", "example.org:8080", "127.0.0.1")
     assert same_site("http://studio:8080", "studio:8080", "0.0.0.0")
     assert not same_site("null", "studio:8080", "0.0.0.0")
-
-
-def test_a_socket_of_another_site_is_closed(subject):
     viser = pytest.importorskip("viser")
     from websockets.exceptions import ConnectionClosed
     from websockets.sync.client import connect
@@ -216,7 +210,6 @@ def test_a_socket_of_another_site_is_closed(subject):
 
 SCRIPT = """
 import logging, sys
-from asymmetric_scene import lopsided, subject_of
 from univoxel.cli.view import command
 from univoxel.viewer import viewer_scene
 
@@ -292,3 +285,64 @@ def test_a_photograph_lies_over_the_render_where_it_was_taken(subject):
         assert torch.allclose(found[4:], expected[4:], atol=1e-4)
         assert torch.equal(found[:4], render[:4])
     assert torch.equal(laid_over(render, photos, 1, cameras.of(torch.tensor([0])), 1.0), render)
+
+
+# A turn around the object: where cameras stand, and the file that comes of it
+
+
+def test_cameras_go_round_a_vertical_axis(subject):
+    """A quarter turn is what an orbit of four has; points of the axis stay in their pixel."""
+    cameras = orbit(subject.traced.mesh, 4, 64)
+    low, high = subject.traced.mesh.vertices.amin(0), subject.traced.mesh.vertices.amax(0)
+    middle = (low + high) / 2
+    first = cameras.of(torch.tensor([0]))
+    turned = turned_about(first, middle, math.pi / 2)
+    torch.testing.assert_close(turned.camera_to_world[0], cameras.camera_to_world[1])
+    axis = middle + torch.tensor([[0.0, 0, 0.1], [0, 0, -0.2]])
+    for angle in (0.3, 2.0):
+        pixel, depth = project(turned_about(first, middle, angle), 0, axis)
+        torch.testing.assert_close(pixel, project(first, 0, axis)[0])
+        torch.testing.assert_close(depth, project(first, 0, axis)[1])
+
+
+def looks(layer="albedo"):
+    return Look(lighting(EnvMap(torch.ones(4, 8, 3))), layer)
+
+
+def made(subject, layer="albedo", **options):
+    files, shares = [], []
+    cameras = orbit(subject.traced.mesh, 1, 48)
+    steps = list(film(subject, cameras, looks(layer), files.append, shares.append, **options))
+    assert len(steps) > 4  # others are served in between
+    assert shares == pytest.approx([(i + 1) / len(shares) for i in range(len(shares))])
+    return files
+
+
+def test_an_mp4_or_else_a_gif(subject, monkeypatch):
+    pytest.importorskip("imageio_ffmpeg")
+    assert kind() == "mp4"
+    (content,) = made(subject, "render", frames=2, samples=2)
+    assert content[4:8] == b"ftyp"
+    monkeypatch.setattr(module, "require", Mock(side_effect=MissingExtra("no encoder")))
+    assert kind() == "gif"
+    (content,) = made(subject, frames=4)
+    with Image.open(io.BytesIO(content)) as picture:
+        assert (picture.format, picture.n_frames, picture.size) == ("GIF", 4, (48, 48))
+        frames = []
+        for number in range(4):
+            picture.seek(number)
+            frames.append(torch.tensor(list(picture.convert("RGB").tobytes())).float())
+    assert all((a - b).abs().mean() > 1 for a, b in pairwise(frames))
+
+
+def test_who_goes_leaves_nothing(subject, tmp_path, monkeypatch):
+    """A viewer that disconnects in the middle: pictures are gone with it, and no film is sent."""
+    monkeypatch.setattr(module.tempfile, "tempdir", str(tmp_path))
+    files, cameras = [], orbit(subject.traced.mesh, 1, 48)
+    steps = film(subject, cameras, looks(), files.append)
+    for _ in range(5):
+        next(steps)
+    assert list(tmp_path.iterdir())
+    steps.close()
+    assert not list(tmp_path.iterdir())
+    assert files == []
