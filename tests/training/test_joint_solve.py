@@ -225,6 +225,7 @@ def events(monkeypatch):
             "build_problem": lambda *_: random_problem(scene=scene),
             "find_metal": lambda *_: torch.zeros(5, dtype=torch.bool),
             "find_mirrors": lambda *_: mirrors if found else None,
+            "evidence": lambda *_: torch.zeros(5),
             "initialise_": lambda s, p, found, *_: (replace(found, only_metal=whole), []),
             "fit_sun_": lambda *_: None,
             "diffuse_albedo": lambda *_: torch.full((5, 3), 0.3),
@@ -243,6 +244,25 @@ def events(monkeypatch):
         return told_of
 
     return solve
+
+
+def test_paint_that_changes_much_is_no_mirror(monkeypatch):
+    """Around the highlight of a sun it changes as a mirror does, and still looks like paint."""
+    scene = scene_of((0.5, 0.5, 0.5), 0.4, 12)
+    problem, no = random_problem(scene=scene), torch.zeros(5, dtype=torch.bool)
+    mirrors = Mirrors(~no, ~no, torch.eye(3)[[0] * 5], torch.full((5, 3), 0.8))
+    paint = torch.tensor([0.8, 0.8, 0.0, -0.5, 0.8])
+    monkeypatch.setattr(joint_solve, "find_mirrors", lambda *_: mirrors)
+    monkeypatch.setattr(joint_solve, "find_metal", lambda *_: no)
+    monkeypatch.setattr(joint_solve, "evidence", lambda *_: paint)
+    labels = joint_solve.with_metals(scene, problem, MaterialLabels(no), CFG, 1.0)
+    assert labels.metal.tolist() == [False, False, True, True, False]
+    assert torch.equal(labels.mirrors.sharp, labels.metal)
+    assert torch.equal(labels.mirrors.base.amax(1) > 0, labels.metal)
+    monkeypatch.setattr(joint_solve, "evidence", lambda *_: torch.ones(5))
+    assert joint_solve.with_metals(scene, problem, MaterialLabels(no), CFG, 1.0).mirrors is None
+    known = replace(MaterialLabels(no), only_metal=True)
+    assert joint_solve.with_metals(scene, problem, known, CFG, 1.0).mirrors is mirrors
 
 
 def within(**known) -> Steps:

@@ -238,6 +238,11 @@ class Mirrors:
     normal: Tensor  # [P, 3] unit, without relief where sharp
     base: Tensor  # [P, 3] what they reflect; 0 elsewhere
 
+    def where(self, kept: Tensor) -> Mirrors | None:
+        """Those of them that are kept, of [P] bool; None: none are."""
+        metal, base = self.metal & kept, torch.where(kept[:, None], self.base, 0.0)
+        return Mirrors(metal, self.sharp & kept, self.normal, base) if metal.any() else None
+
 
 @dataclass(frozen=True)
 class MaterialLabels:

@@ -43,11 +43,12 @@ from univoxel.training.metals import (
     TRIAL_POINTS,
     TRIAL_ROUNDS,
     TRIAL_STEPS,
+    evidence,
     find_metal,
     initialise_,
     neutralise_,
 )
-from univoxel.training.mirrors import find_mirrors
+from univoxel.training.mirrors import PAINT, find_mirrors
 from univoxel.training.newton import NewtonRound, newton_round_
 from univoxel.training.progress import Progress
 
@@ -273,6 +274,8 @@ def with_metals(
     if not decisions.only_metal:
         metal = find_metal(scene, problem, cfg, done, decisions.likely)
     mirrors = find_mirrors(scene, problem)
+    if mirrors is not None and not decisions.only_metal:
+        mirrors = mirrors.where(evidence(scene, problem, cfg) < PAINT)
     if mirrors is not None:
         metal = metal | mirrors.metal
     return replace(decisions, metal=metal, mirrors=mirrors)

@@ -56,6 +56,9 @@ REFLECTED = 0.55
 REFLECTED_AT_MOST = 1.25
 # Part of the change that the map leaves unexplained where metal mirrors sharply
 SHARP = 0.6
+# Log ratio of residuals, see `metals.evidence`, from which a point is paint however much it
+# changes. Around the highlight of a sun on paint it was 0.8, of mirrors -0.2 and rarely above
+PAINT = 0.25
 # Degrees around a direction, whose brightest node tells how dark it is
 AROUND = 27.0
 # Share of the directions, the darkest, that base colours are read from
