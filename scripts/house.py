@@ -19,9 +19,9 @@ sys.path.insert(0, str(ROOT / "tests"))
 from layers import LAYERS, violations  # noqa: E402
 
 LIMITS = {
-    "lines of the package": 36_930,
+    "lines of the package": 36_940,
     "lines of the laboratory": 5_300,
-    "lines of tests": 37_395,
+    "lines of tests": 34_600,
     "modules of the package": 162,
     "loose modules at the top": 12,
     "configuration fields": 126,
