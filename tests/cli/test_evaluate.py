@@ -160,6 +160,14 @@ def test_on_white_in_json_and_of_other_data(folders, relit_calls, tmp_path, monk
     assert not black.photo[outside].any()
     torch.testing.assert_close(white.photo[outside], torch.ones_like(white.photo[outside]))
     assert torch.equal(black.photo[inside()], white.photo[inside()])
+    opaque = picture(true_albedo(0))
+    opaque[..., 3] = 255  # black where the render shows what is behind
+    write_png(folders.data / "test" / "r_0.png", opaque)
+    on_white, on_black = (
+        task.evaluate(folders.run, data=folders.data, background=behind)["nvs_psnr"]
+        for behind in ("white", "black")
+    )
+    assert on_white < 60 < on_black
 
 
 def test_raw_albedo_against_a_formula(folders, relit_calls):

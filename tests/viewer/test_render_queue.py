@@ -138,14 +138,15 @@ def test_chores_go_on_beside_pictures(studio, watcher, subject, light):
     assert sorted(seen) == [("a", i) for i in range(5)] + [("b", i) for i in range(3)]
     assert [step for name, step in seen if name == "a"] == list(range(5))
 
-    held = threading.Event()
+    begun, held = threading.Event(), threading.Event()
 
-    def endless():
-        while True:
-            held.wait(PATIENCE)
-            yield
+    def ends():
+        begun.set()
+        held.wait(PATIENCE)
+        yield from ()
 
-    studio.do(watcher.viewer, "c", endless())
+    studio.do(watcher.viewer, "c", ends())
+    assert begun.wait(PATIENCE)
     studio.do(watcher.viewer, "c", chore("c", 1))
     held.set()
     watcher.wait(lambda: seen[-1] == ("c", 0))
@@ -210,6 +211,7 @@ def test_a_socket_of_another_site_is_closed(subject):
 
 SCRIPT = """
 import logging, sys
+from asymmetric_scene import lopsided, subject_of
 from univoxel.cli.view import command
 from univoxel.viewer import viewer_scene
 
