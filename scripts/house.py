@@ -21,7 +21,7 @@ from layers import LAYERS, violations  # noqa: E402
 LIMITS = {
     "lines of the package": 36_940,
     "lines of the laboratory": 5_300,
-    "lines of tests": 34_600,
+    "lines of tests": 34_610,
     "modules of the package": 162,
     "loose modules at the top": 12,
     "configuration fields": 126,

@@ -1,6 +1,7 @@
 """The object told by depth alone: planes behind it, and what stands before them."""
 
 import numpy as np
+import pytest
 import textured_room
 import torch
 from spoilt_masks import iou, without_depth
@@ -16,7 +17,14 @@ from univoxel.preparation.standing_object import (
     middle_part,
     surface_nodes,
 )
-from univoxel.preparation.stereo import reach
+from univoxel.preparation.stereo import depth_maps, reach
+
+
+@pytest.fixture(scope="module")
+def room():
+    """As elsewhere, in pictures so large that the edges of the masks count for less."""
+    photos = textured_room.photos_of(textured_room.orbit(30, 200, 150))
+    return photos, depth_maps(photos)
 
 
 def test_masks_are_those_of_the_object(room):

@@ -80,7 +80,7 @@ class Listed:
 
 
 def present(
-    where: Path, found: Iterable[Shot | str], looked: str = ""
+    where: Path, found: Iterable[Shot | str | Path], looked: str = ""
 ) -> tuple[list[Shot], list[str]]:
     """Photographs that a file or folder lists, but for those that are not there: in their place
     stands a name. Returns remarks on them, too; arguments and errors as in `left_out`."""

@@ -187,8 +187,8 @@ def require_embree(what: str) -> ModuleType:
 def call(kernel: str | Callable, *arguments: Any) -> Any:
     """Call a kernel, by name or as it is: with tensors as `arrays`, and the number of threads as
     last argument."""
-    kernel = getattr(require(), kernel) if isinstance(kernel, str) else kernel
-    return kernel(*arrays(*arguments), threads())
+    called = getattr(require(), kernel) if isinstance(kernel, str) else kernel
+    return called(*arrays(*arguments), threads())
 
 
 def arrays(*arguments: Any) -> list[Any]:
