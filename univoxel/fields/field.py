@@ -246,7 +246,7 @@ class NodeField(Field):
         values = self.features.detach()
         if more := len(self.sdf) - len(values):
             values = torch.cat([values, values.new_zeros(more, *values.shape[1:])])
-            self.features = nn.Parameter(values, self.features.requires_grad)
+            self.features: nn.Parameter = nn.Parameter(values, self.features.requires_grad)
         return grown
 
     def hold_channels_(self, count: int) -> None:
